@@ -177,11 +177,8 @@ class AutopilotCheck:
     def __init__(self, params: Any, backend: Any) -> None:
         """Begin with nothing heard of the back-end; a dry run has no autopilot."""
         self.backend = backend
-        self.meter = (
-            None
-            if params.backend == "dry-run"
-            else HoverMeter(getattr(params, params.backend).thrust)
-        )
+        vehicle = params.vehicle
+        self.meter = None if vehicle is None else HoverMeter(vehicle.thrust)
 
     def status(self, time: float) -> Status:
         """Return what the runner is to know of it at a time [s]; what the audit found is said by
@@ -226,7 +223,7 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     folder = Path(folder)
     require_run(folder)
     params, policy = load_setup(folder)
-    if params.backend == "dry-run":
+    if params.vehicle is None:
         raise RunError(
             f"{folder} is a dry run: nothing followed its commands; expected a run with an"
             " autopilot"
@@ -246,7 +243,7 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
             f" or more, after {SETTLING}: hover longer before a throw, as with --set"
             " states.armed_least=3.0"
         )
-    thrust = getattr(params, params.backend).thrust
+    thrust = params.vehicle.thrust
     commanded = sum(thrusts) / len(thrusts)
     ratio = commanded / weight
     text = (

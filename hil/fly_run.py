@@ -48,8 +48,8 @@ def require_fake(params: HilParams) -> None:
     """
     devices = [params.link.device, params.source.device or params.link.device]
     devices += [f"udp:{member}" for member in (params.team.members if params.team else ())]
-    if params.backend in ("betaflight", "crazyflie"):
-        devices.append(getattr(params, params.backend).device)
+    if hasattr(params.vehicle, "device"):
+        devices.append(params.vehicle.device)
     remote = [device for device in devices if not _is_loopback(device)]
     if params.source.kind == "mocap":
         remote.append(f"source.kind {params.source.kind}")

@@ -5,7 +5,7 @@ SI units; nothing about frames has a default.
 """
 
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
 from hil.control.aim import AimParams
@@ -163,6 +163,11 @@ class HilParams(Bounded):
                     f"frames.{name}.quaternion is '{frames.quaternion}'; a source of kind"
                     f" {self.source.kind} writes '{written}'"
                 )
+
+    @property
+    def vehicle(self) -> Any:
+        """Table of the back-end; None for a dry run."""
+        return getattr(self, self.backend, None)
 
     def _missing_parts(self) -> tuple[tuple[bool, str], ...]:
         """Return rules on tables and their combinations: whether each is broken, and its error."""

@@ -1,6 +1,7 @@
-"""Actions of ``visthrow hil``, a module each, and the options that they share."""
+"""Actions of ``visthrow hil`` and their options; what does an action is imported when it runs."""
 
 import argparse
+from pkgutil import resolve_name
 
 from visthrow.common.arguments import add_table
 from visthrow.common.toml_text import tables_beside
@@ -9,6 +10,13 @@ TABLES = tables_beside(__file__, "commands.toml")
 """Groups of arguments: those of an action bear its name."""
 
 FLIES = ("run", "record", "calibrate")
+
+FUNCTIONS = dict.fromkeys(FLIES, "hil.fly_run:fly") | {
+    "check": "hil.check:check",
+    "replay": "hil.control.recording.playback:compare_run",
+    "view": "hil.control.recording.view:run",
+}
+"""Action -> the function that does it."""
 
 EXAMPLES = """
   visthrow hil run                              dry run: poses on udp port 14560, nothing is sent
@@ -48,3 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if group in TABLES:
             add_table(TABLES[group], parser)
     parser.epilog = examples(action)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do the chosen action and return the exit status."""
+    return resolve_name(FUNCTIONS[args.action])(args)

@@ -3,7 +3,7 @@ payload's poses.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -62,22 +62,17 @@ class Landing:
     separation_w: Vector | None = None  # payload's centre at that time [m]
 
 
+@dataclass
 class PayloadFlight:
     """Collects a payload's poses from the latch to the landing."""
 
-    def __init__(
-        self, goal_w: Vector, start: float, latch: float, height: float, lag: float = 0.0
-    ) -> None:
-        """Begin at the latch [s] of a throw; the payload separates a lag later [s], and its centre
-        lands at a height [m].
-        """
-        self.goal_w = goal_w
-        self.start = start
-        self.latch = latch
-        self.height = height
-        self.lag = lag
-        self._times: list[float] = []
-        self._points: list[Vector] = []
+    goal_w: Vector  # [m]
+    start: float  # of the throw [s]
+    latch: float  # of the release [s]
+    height: float  # of the payload's centre as it lands [m]
+    lag: float = 0.0  # from latch to separation [s]
+    _times: list[float] = field(default_factory=list)
+    _points: list[Vector] = field(default_factory=list)
 
     def add(self, time: float, pos: Vector) -> Landing | None:
         """Take a pose of the payload, measured at a time [s], in our frames [m]; return the landing

@@ -6,25 +6,28 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 
-class Clock(Protocol):
+class Clock:
     """A clock that never goes back."""
 
     def now(self) -> float:
         """Return the time [s]."""
-
-    def sleep_until(self, when: float) -> None:
-        """Wait until a time [s]; at once where it has passed."""
+        raise NotImplementedError
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
         """Wait until there is something to read from a file (anything with ``fileno``), or until a
         time [s].
         """
+        raise NotImplementedError
+
+    def sleep_until(self, when: float) -> None:
+        """Wait until a time [s]; at once where it has passed."""
+        self.wait_for((), when)
 
 
-class MonotonicClock:
+class MonotonicClock(Clock):
     """The machine's monotonic clock; at ``speed`` 0.5 its second takes two."""
 
     def __init__(self, speed: float = 1.0) -> None:
@@ -36,18 +39,13 @@ class MonotonicClock:
     def now(self) -> float:
         return time.monotonic() * self._speed
 
-    def sleep_until(self, when: float) -> None:
-        remaining = (when - self.now()) / self._speed
-        if remaining > 0.0:
-            time.sleep(remaining)
-
     def wait_for(self, files: Sequence[Any], when: float) -> None:
         remaining = (when - self.now()) / self._speed
         if remaining > 0.0:
             select.select(files, [], [], remaining)
 
 
-class ManualClock:
+class ManualClock(Clock):
     """A clock that is where it was put: for tests and replay."""
 
     def __init__(self, start: float = 0.0) -> None:  # [s]
@@ -56,11 +54,8 @@ class ManualClock:
     def now(self) -> float:
         return self.time
 
-    def sleep_until(self, when: float) -> None:
-        self.time = max(self.time, when)
-
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        self.sleep_until(when)
+        self.time = max(self.time, when)
 
 
 @dataclass

@@ -38,6 +38,11 @@ class Packet:
         return bytes([self.port << FACTS["header_shift"] | self.channel & 3]) + self.data
 
 
+def message(port: str, channel: str, data: bytes) -> bytes:
+    """Return the packet of a port and a channel by their names among the facts."""
+    return Packet(FACTS[port], FACTS[channel], data).pack()
+
+
 def unpack(data: bytes) -> Packet | None:
     """Return the packet of some bytes; None where they are none."""
     if not 1 <= len(data) <= MOST:
@@ -52,19 +57,19 @@ def manual(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
     axes = zip(rates_dps, ("roll", "pitch", "yaw"))
     signed = (FACTS[f"manual_{axis}_sign"] * rate for rate, axis in axes)
     data = MANUAL.pack(FACTS["manual"], *signed, thrust, FACTS["manual_rate"])
-    return Packet(FACTS["port_generic"], FACTS["channel_set_point"], data).pack()
+    return message("port_generic", "channel_set_point", data)
 
 
 def position(place_w: tuple[float, ...], yaw_deg: float) -> bytes:
     """Return the set-point of a place [m], z up, and heading [deg] that it is to hold by itself."""
     data = POSITION.pack(FACTS["position"], *place_w, yaw_deg)
-    return Packet(FACTS["port_generic"], FACTS["channel_set_point"], data).pack()
+    return message("port_generic", "channel_set_point", data)
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
     """Return the position [m], z up, and attitude xyzw for its estimator."""
     data = POSE.pack(FACTS["external_pose"], *pos, *quat)
-    return Packet(FACTS["port_localization"], FACTS["channel_pose"], data).pack()
+    return message("port_localization", "channel_pose", data)
 
 
 def named(name: str) -> bytes:
@@ -75,25 +80,23 @@ def named(name: str) -> bytes:
 def set_parameter(name: str, value: int) -> bytes:
     """Return a parameter of eight bits, by its name."""
     data = bytes([FACTS["set_by_name"]]) + named(name) + bytes([FACTS["type_uint8"], value])
-    return Packet(FACTS["port_param"], FACTS["channel_by_name"], data).pack()
+    return message("port_param", "channel_by_name", data)
 
 
 def arm(on: bool) -> bytes:
     """Return the request to arm or disarm."""
     data = bytes([FACTS["arm"], on])
-    return Packet(FACTS["port_supervisor"], FACTS["channel_command"], data).pack()
+    return message("port_supervisor", "channel_command", data)
 
 
 def ask_state() -> bytes:
     """Return the question for the supervisor's state."""
-    data = bytes([FACTS["ask_state"]])
-    return Packet(FACTS["port_supervisor"], FACTS["channel_info"], data).pack()
+    return message("port_supervisor", "channel_info", bytes([FACTS["ask_state"]]))
 
 
 def ask_protocol() -> bytes:
     """Return the question for the protocol's version."""
-    data = bytes([FACTS["ask_protocol"]])
-    return Packet(FACTS["port_platform"], FACTS["channel_version"], data).pack()
+    return message("port_platform", "channel_version", bytes([FACTS["ask_protocol"]]))
 
 
 class CflibPort:

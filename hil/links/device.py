@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from hil.errors import LinkError
+from visthrow.common.extras import load_extra
 
 _NETWORK = re.compile(r"(udp|udpout|tcp):([0-9.]+|\[[0-9a-fA-F:]+\]|localhost):([0-9]{1,5})")
 _SERIAL = re.compile(
@@ -232,12 +233,7 @@ class SerialPort(_Stream):
 
     def __init__(self, device: Device) -> None:
         """Open it; raises `LinkError` where pyserial is missing, or the port cannot be opened."""
-        try:
-            import serial
-        except ModuleNotFoundError:
-            raise LinkError(
-                "a serial port needs pyserial; install it with: pip install 'visthrow[serial]'"
-            ) from None
+        serial = load_extra("serial", "serial", "a serial port", LinkError)
         try:
             self._open = serial.Serial(device.host, device.port, timeout=0, write_timeout=0)
         except (serial.SerialException, ValueError) as error:

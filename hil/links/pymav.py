@@ -67,9 +67,7 @@ class Parser:
             ]
         if whole and self._mav.buf_len():
             self.errors += 1
-            self._mav.buf = bytearray()
-            self._mav.buf_index = 0
-            self._mav.expected_length = mav.HEADER_LEN_V1 + 2
+            self._fresh()
         return messages
 
 

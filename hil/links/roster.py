@@ -134,7 +134,7 @@ class Roster:
         and answered. ``allow``: addresses that may send at all; none: any.
         """
         self.parties = tuple(parties)
-        self._allow = check_allowed(allow)
+        self._allow = set(check_allowed(allow))
         self.tell = tell
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
@@ -149,22 +149,19 @@ class Roster:
         """Return whether a datagram is not even looked into: not from the device's peer, not on the
         list, from nobody in flight.
         """
-        why = None
-        if address is not None and self.only not in (None, address):
+        if address is None:
+            return False
+        host, number = address
+        if self.only not in (None, address):
             why = f"the link's device is {address_text(self.only)}"
-        elif (
-            address is not None
-            and self._allow
-            and not any(h == address[0] and port in (None, address[1]) for h, port in self._allow)
-        ):
+        elif self._allow and not {(host, number), (host, None)} & self._allow:
             why = "not on link.allow"
-        elif (
-            address is not None and self.flying and self.parties and address not in self.at.values()
-        ):
+        elif self.flying and self.parties and address not in self.at.values():
             why = "another sender while it flies"
-        if why is not None:
-            self.refuse(Traffic(address, None, None, "datagram", why))
-        return why is not None
+        else:
+            return False
+        self.refuse(Traffic(address, None, None, "datagram", why))
+        return True
 
     def refuse(self, traffic: Traffic, count: int = 1) -> None:
         """Count what is not taken, and say who sent it."""

@@ -15,7 +15,7 @@ from camera.detectors.contours import BallSeen, FrameDetections, GoalSeen, detec
 from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
 from camera.mount import rotation_from_vector
 from hil.poses.pose import Quaternion, Vector
-from visthrow.common.rotations import matrix_of_quat
+from visthrow.common.rotations import continuous, matrix_of_quat
 from visthrow.onboard.calibration import Calibration
 
 # radius in the image beyond which what is not seen any more has left the field of view, of 1
@@ -157,15 +157,10 @@ class Detections:
         """Return the place and the quaternion, of any length, at a time on the path, by straight
         lines; its ends beyond them.
         """
-        path = list(self._path)
-        after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
-        if after == 0 or path[after][0] <= when:
-            return path[after][1:]
-        begin, pos, quat = path[after - 1]
-        end, pos_after, quat_after = path[after]
-        share = (when - begin) / (end - begin)
-        nearest = quat_after if quat @ quat_after > 0.0 else -quat_after
-        return pos + share * (pos_after - pos), quat + share * (nearest - quat)
+        times, places, quats = map(np.array, zip(*self._path))
+        columns = np.column_stack([places, continuous(quats)])
+        pose = np.array([np.interp(when, times, column) for column in columns.T])
+        return pose[:3], pose[3:]
 
     def keypoints(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape

@@ -25,7 +25,7 @@ from visthrow.common.rotations import (
     tilt_and_heading,
     vectors_between,
 )
-from visthrow.logs.axes import OURS, TURNS, turn_of
+from visthrow.logs.axes import TURNS, turn_of
 
 # below both the vehicle rests: noise of a millimetre and of 0.3 deg stays below
 SPEED = 0.06  # [m/s]
@@ -161,25 +161,17 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
     turns = [(move.axis, step) for move, step in pairs if move.turn]
     world = max(TURNS, key=lambda axes: _agreement(turn_of(axes), ways))
-    in_world, in_body = {}, {}
-    for order in ("xyzw", "wxyz"):
-        tried = replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)
-        vectors = [(i, *step.turns(Frames(tried))) for i, step in turns]
-        in_world[order] = _agreement(np.eye(3), [(i, vector) for i, vector, _ in vectors])
-        in_body[order] = [(i, vector) for i, _, vector in vectors]
+    cases = [
+        replace(frames, axes=world, body_axes=body, quaternion=order, yaw_offset_deg=0.0)
+        for order, body in product(("xyzw", "wxyz"), TURNS)
+    ]
 
-    def fit(case: tuple[str, str]) -> float:
-        order, body = case
-        return round(in_world[order] + _agreement(turn_of(body), in_body[order]), 9)
+    def fit(case: FrameParams) -> float:
+        tried = Frames(case)
+        vectors = [(axis, vector) for axis, step in turns for vector in step.turns(tried)]
+        return round(_agreement(np.eye(3), vectors), 9)
 
-    order, body = max(product(in_world, TURNS), key=fit)
-    fitting = replace(
-        frames,
-        axes=world,
-        body_axes=body,
-        quaternion=order,
-        yaw_offset_deg=_yaw(ways, turn_of(world)),
-    )
+    fitting = replace(max(cases, key=fit), yaw_offset_deg=_yaw(ways, turn_of(world)))
     lines = [*(_line(move, step, frames) for move, step in pairs), _start(steps[0].before, frames)]
     mirrored = bool(
         np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5

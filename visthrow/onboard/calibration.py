@@ -32,6 +32,7 @@ from camera.keypoints import (
 )
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams
+from visthrow import config
 from visthrow.common.errors import VisthrowError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.config.bounds import Bounded, Positive
@@ -132,10 +133,7 @@ class Calibration:
 
     def values(self) -> dict[str, Any]:
         """Return the estimates for JSON."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in vars(self).items()
-        }
+        return config.to_dict(self)
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Calibration":

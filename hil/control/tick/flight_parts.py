@@ -54,11 +54,11 @@ class FlightParts:
         check = params.check
         contract = policy.contract
         rope = contract["rope"]
-        dry = params.backend == "dry-run"
+        dry = params.vehicle is None
         self.vehicle_mass = contract["vehicle"]["body"]["mass"]
         self.mass = self.vehicle_mass + rope["rope_mass"] + rope["payload_mass"]
         self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
-        tolerance = math.inf if dry else getattr(params, params.backend).thrust.tolerance
+        tolerance = math.inf if dry else params.vehicle.thrust.tolerance
         self.thrust_tolerance = tolerance
         self.trained_age = 0.5 * sum(contract["observation"]["latency"])
         self.machine = Machine(params.states, params.throws, params.observe, not dry)

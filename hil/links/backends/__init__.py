@@ -32,7 +32,7 @@ def mechanism_lag(params: Any) -> float:
     """Return the time from the release command to separation [s] of the mechanism of a run's
     back-end; 0 for a dry run.
     """
-    return 0.0 if params.backend == "dry-run" else getattr(params, params.backend).mechanism_lag
+    return 0.0 if params.vehicle is None else params.vehicle.mechanism_lag
 
 
 def make_backend(
@@ -53,11 +53,11 @@ def make_backend(
         folder: of the run, where MSP is written down as the link's messages are in its .tlog.
     """
     name = params.backend
-    vehicle = getattr(params, params.backend.replace("-", "_"), None)
+    vehicle = params.vehicle
     backend: Backend
-    if name == "dry-run":
-        backend = DryRun()
-    elif name == "betaflight":
+    if vehicle is None:
+        return DryRun()
+    if name == "betaflight":
         device = check_device(vehicle.device, remote=vehicle.remote)
         if device.kind not in ("tcp", "serial"):
             raise RunError(
@@ -74,16 +74,16 @@ def make_backend(
         raise RunError(f"backend {name} without a MAVLink link; expected source.kind mavlink")
     else:
         backend = AUTOPILOTS[name](link, vehicle, write, tell)
-    return Held(backend, params.delay.hold) if params.delay.hold and name != "dry-run" else backend
+    return Held(backend, params.delay.hold) if params.delay.hold else backend
 
 
 def require_reach(params: Any, contract: dict[str, Any]) -> None:
     """Raise `RunError` for a vehicle that by its configuration is not the policy's: another weight,
     or a calibration and rate profile that do not reach what the policy was trained to command.
     """
-    if params.backend == "dry-run":
+    vehicle = params.vehicle
+    if vehicle is None:
         return
-    vehicle = getattr(params, params.backend)
     action = contract["action"]
     rope = contract["rope"]
     mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]

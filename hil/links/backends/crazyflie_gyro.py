@@ -9,7 +9,7 @@ import math
 import struct
 from collections.abc import Callable
 
-from hil.links.crtp import Packet
+from hil.links.crtp import message
 from hil.links.facts import values
 
 FACTS = values("crazyflie")
@@ -63,7 +63,7 @@ class GyroStream:
                 self._send("log_contents", struct.pack("<BH", FACTS["log_item"], number))
 
     def _send(self, channel: str, data: bytes) -> None:
-        self._put(Packet(FACTS["port_log"], FACTS[channel], data).pack())
+        self._put(message("port_log", channel, data))
 
     def hear(self, channel: int, data: bytes) -> None:
         """Take a packet of the logging port."""

@@ -54,7 +54,7 @@ def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
             kinds = frozenset(COMPANIONS.get(ids.message, (ids.message,)))
             bodies.append(Party(ids.body, ids.system, ids.component, kinds))
     if autopilot and params.backend in AUTOPILOTS:
-        vehicle = getattr(params, params.backend)
+        vehicle = params.vehicle
         bodies.append(
             Party(
                 "autopilot",
