@@ -161,7 +161,7 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
-    for entry, count in sorted(roster.seen.items(), key=lambda row: -row[1]):
+    for entry, count in roster.seen.most_common():
         if silent or entry.why:
             lines.append(f"  {count / seconds:.1f} a second: {entry.text()}")
     if silent and not roster.seen:

@@ -52,16 +52,16 @@ class Operator(Protocol):
         """Return the commands since the last tick in a ``state`` of the runner; never waits."""
 
 
+@dataclass
 class LandAfterCalibration:
     """An operator who lands once the camera is calibrated, and never arms."""
 
-    def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
-        self._operator = operator
-        self._calibrating = calibrating
+    operator: Operator  # whose other words count
+    calibrating: Calibrating
 
     def words(self, state: str) -> OperatorInput:
-        words = self._operator.words(state)
-        calibrated = self._calibrating.calibration is not None
+        words = self.operator.words(state)
+        calibrated = self.calibrating.calibration is not None
         return replace(words, arm=False, land=words.land or calibrated)
 
 

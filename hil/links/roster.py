@@ -7,6 +7,7 @@ the ground a party that has fallen silent may come back from another address (a 
 started again); in flight none may."""
 
 import ipaddress
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -139,7 +140,7 @@ class Roster:
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
         self.flying = self.simulated = False
-        self.seen: dict[Traffic, int] = {}
+        self.seen: Counter[Traffic] = Counter()
         self.refused = 0
         self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
@@ -174,7 +175,7 @@ class Roster:
 
     def _count(self, traffic: Traffic, count: int = 1) -> None:
         traffic = traffic if traffic in self.seen or len(self.seen) < MOST_KEPT else OTHER_TRAFFIC
-        self.seen[traffic] = self.seen.get(traffic, 0) + count
+        self.seen[traffic] += count
 
     def admit(self, message: Any, address: Address, host_time: float) -> bool:
         """Return whether a message is one of a party's; binds the party to its sender's address at
@@ -296,19 +297,14 @@ class Roster:
 
     def summary(self) -> dict[str, Any]:
         """Return who was heard from where, and what was refused, most first."""
-        refused = sorted(
-            (
-                (n, traffic)
-                for traffic, n in self.seen.items()
-                if traffic.why or traffic is OTHER_TRAFFIC
-            ),
-            key=lambda row: -row[0],
-        )
+        refused = [
+            {"count": count, "what": traffic.text()}
+            for traffic, count in self.seen.most_common()
+            if traffic.why or traffic is OTHER_TRAFFIC
+        ]
         return {
             "at": {name: address_text(address) for name, address in self.at.items()},
             "simulated": self.simulated,
             "refused": self.refused,
-            "refused_most": [
-                {"count": n, "what": traffic.text()} for n, traffic in refused[:MOST_SAID]
-            ],
+            "refused_most": refused[:MOST_SAID],
         }

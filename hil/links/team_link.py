@@ -100,10 +100,9 @@ class TeamLink:
         self.offset = offset
         self._period = period
         self._agreement = Agreement(params.member, len(devices), params.delay)
-        self._port = open_port(devices.pop(params.member))
-        numbers = [k for k in range(len(params.members)) if k != params.member]
-        addresses = [(device.host, device.port) for device in devices]
-        self._others = dict(zip(addresses, numbers, strict=True))
+        self._port = open_port(devices[params.member])
+        members = {(device.host, device.port): k for k, device in enumerate(devices)}
+        self._others = {address: k for address, k in members.items() if k != params.member}
 
     def agreed(self, time: float) -> int:
         """Read what has come; return what all agreed on for the tick at a time [s]."""

@@ -14,6 +14,7 @@ however far: a payload that has come off takes no pose of the vehicle with it. P
 coming, but more rarely than ``hold``, are as good as none."""
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 from hil.poses.pose import Pose, Vector
@@ -84,7 +85,7 @@ class Gate:
 
     def __init__(self, params: GateParams) -> None:
         self.params = params
-        self.refused: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
         self.restart()
 
     def restart(self) -> None:
@@ -107,7 +108,7 @@ class Gate:
         Returns why it is refused, or None where it is accepted; `REASONS` says what each means."""
         reason = self._reason(pose, velocity, tether)
         if reason is not None:
-            self.refused[reason] = self.refused.get(reason, 0) + 1
+            self.refused[reason] += 1
             return reason
         first = self.last is None
         self.last = pose

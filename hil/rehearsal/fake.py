@@ -83,8 +83,6 @@ class FakeOptions(Bounded):
     answer_delay: NotNegative = 0.002  # 1 to 3 ms were measured [s]
     # from a release to the output's movement; 1 to 3 ms were measured [s]
     servo_delay: NotNegative = 0.002
-    # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
-    timesync_delay: float = 0.0
     # from a release to the latch of the plant, whose own lag, the output's movement in it, follows
     # [s]
     mechanism: NotNegative = 0.0
@@ -238,6 +236,7 @@ class Fake(ABC):
         self._to_source: Callable[[Pose], Pose] = ned.source_from_pose
         self._hover = HoverController(HoverParams(max_thrust=plant.max_thrust), plant.period)
         self._payload_sender = link.packer(*PAYLOAD_ID)
+        self._payload_sender.file = link.port
         self._announced = -np.inf
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._set_points = SetPoints()
@@ -450,8 +449,7 @@ class Fake(ABC):
 
     def _send_pose(self, message: Any, body: str) -> None:
         if body == PAYLOAD:
-            self.link.port.write(message.pack(self._payload_sender))
-            self._payload_sender.seq = (self._payload_sender.seq + 1) % 256
+            self._payload_sender.send(message)
         else:
             self.link.send(message)
 

@@ -36,7 +36,6 @@ class FakeMavlink(Fake):
         self._next_beat = 0.0
         # by message: time of the next one, and period [s]
         self._streams: dict[int, tuple[float, float]] = {}
-        self.refusals: list[str] = []
         self.link.listen(self._hear)
 
     def _hear(self, message: Any, arrival: float) -> None:
@@ -50,10 +49,7 @@ class FakeMavlink(Fake):
             self._command(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
             now = arrival + self.question_lag + self.options.clock_offset
-            self.say(
-                mav.MAVLink_timesync_message(int(now * 1e9), message.ts1),
-                self.options.timesync_delay,
-            )
+            self.link.send(mav.MAVLink_timesync_message(int(now * 1e9), message.ts1))
         elif kind == "PARAM_REQUEST_READ" and message.target_system == VEHICLE_ID[0]:
             self._tell_parameter(message.param_id)
         elif kind == "PARAM_SET" and message.param_id in self.parameters:

@@ -27,9 +27,9 @@ def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ())
     where there are any; raises `RunError` where there is none, or one
     that makes no plant of these two.
     """
+    arguments = (policy, seed, *([changes] if changes else []))
     try:
         make = resolve_name(target)
-        arguments = (policy, seed, *([changes] if changes else []))
         inspect.signature(make).bind(*arguments)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise RunError(

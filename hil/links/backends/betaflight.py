@@ -198,7 +198,7 @@ class Betaflight(OnPort):
         return "MSP OVERRIDE is on before the runner is ready: switch it off" if early else "", WAIT
 
     def _box(self, number: int) -> bool:
-        return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
+        return is_on(number, self._boxes, self._flags)
 
     def send(self, command: Command, host_time: float) -> bool:
         thrust, *rates = command
@@ -431,6 +431,11 @@ SETTINGS = {
     if name.startswith("tells_")
 }
 """Which answer tells which setting. Some hold more than a number: see :func:`settings`."""
+
+
+def is_on(box: int, boxes: tuple[int, ...], flags: int) -> bool:
+    """Return whether a flight mode is on, by MSP_BOXIDS and the flags of MSP_STATUS."""
+    return box in boxes and bool(flags >> boxes.index(box) & 1)
 
 
 def blocked(flags: int) -> str:

@@ -13,7 +13,15 @@ from typing import Any
 import numpy as np
 
 from hil.links import msp
-from hil.links.backends.betaflight import ARRIVED, BOX_ARM, FACTS, HIGH, STICKS, BetaflightParams
+from hil.links.backends.betaflight import (
+    ARRIVED,
+    BOX_ARM,
+    FACTS,
+    HIGH,
+    STICKS,
+    BetaflightParams,
+    is_on,
+)
 from hil.links.device import Device, TcpPort, chunks
 from hil.rehearsal.bridges.betaflight_firmware import PORTS
 from hil.rehearsal.bridges.packets import Sensors
@@ -106,7 +114,7 @@ class BetaflightSitl(Bridge):
     def _hear_status(self, frame: msp.Frame) -> None:
         flags = frame.number("<I", FACTS["status_flags"]) or 0
         cycle = frame.number("<H", 0)
-        armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
+        armed = is_on(BOX_ARM, self._boxes, flags)
         if armed != self.armed:
             self.happened("armed" if armed else "disarmed")
         self.armed = armed
