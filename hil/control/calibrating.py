@@ -71,18 +71,17 @@ def _warm() -> None:
     torch.set_num_threads(1)
 
 
+@dataclass
 class Calibrating:
-    """The hover and the sway of a run; ``calibration`` is the result, None before it."""
+    """The hover and the sway of a run, from the first calm hover on."""
 
-    def __init__(self, params: CalibrationParams) -> None:
-        """Wait for the first calm hover."""
-        self.params = params
-        self.calibration: Calibration | None = None
-        self._problem = ""  # of the last attempt
-        self._begin: float | None = None
-        self._rows: list[tuple] = []
-        self._due: Hovered | None = None
-        self._solving = False
+    params: CalibrationParams
+    calibration: Calibration | None = None  # the result; None before it
+    _problem: str = ""  # of the last attempt
+    _begin: float | None = None
+    _rows: list[tuple] = field(default_factory=list)
+    _due: Hovered | None = None
+    _solving: bool = False
 
     def rates(self, time: float, calm: bool, goal_w: Vector) -> tuple[float, float]:
         """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``calm``: the vehicle

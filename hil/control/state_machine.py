@@ -96,48 +96,28 @@ class Inputs:
         return max(self.vehicle, self.payload) >= HOLD
 
 
+@dataclass
 class Machine:
-    """The state, and the time and reason of its last change.
+    """The state, and the time and reason of its last change."""
 
-    Attributes:
-        state: of this tick.
-        reason: of the last change.
-        since: time of the last change [s].
-        throws: throws begun.
-        cancelled: throws that ended without a release.
-        flown: whether this run has ever commanded the vehicle.
-        aborted: whether an abort ended the run.
-        handed_back: whether the vehicle went back to the autopilot's own hold, or to the pilot.
-        ready_to_throw: whether nothing but the team's word is missing.
-        left_fence: how the vehicle left its fence after a throw, which ends the run by a landing
-            without an abort.
-    """
-
-    def __init__(
-        self, params: StateParams, throws: int, patient: bool = False, sends: bool = True
-    ) -> None:
-        """Begin in idle.
-
-        Args:
-            params: time-outs and durations.
-            throws: after which it lands.
-            patient: whether idle and check have no time-out, as where poses are only observed.
-            sends: whether commands go to a vehicle. Without, no fence applies before a throw is
-                armed: others fly.
-        """
-        self.params = params
-        self.max_throws = throws
-        self.patient = patient
-        self.sends = sends
-        self.state = State.IDLE
-        self.reason = "start"
-        self.since: float | None = None
-        self.throws = self.cancelled = 0
-        self.flown = self.aborted = False
-        self.left_fence: str | None = None
-        self.handed_back = False
-        self.ready_to_throw = False
-        self._lasting_since: float | None = None  # of the condition that must last [s]
+    params: StateParams  # time-outs and durations
+    max_throws: int  # after which it lands
+    patient: bool = False  # idle and check have no time-out, as where poses are only observed
+    # whether commands go to a vehicle. Without, no fence applies before a throw is armed: others
+    # fly.
+    sends: bool = True
+    state: State = State.IDLE  # of this tick
+    reason: str = "start"  # of the last change
+    since: float | None = None  # time of the last change [s]
+    throws: int = 0  # begun
+    cancelled: int = 0  # throws that ended without a release
+    flown: bool = False  # whether this run has ever commanded the vehicle
+    aborted: bool = False  # whether an abort ended the run
+    # how the vehicle left its fence after a throw, which ends the run by a landing without an abort
+    left_fence: str | None = None
+    handed_back: bool = False  # whether the autopilot's own hold, or the pilot, has it again
+    ready_to_throw: bool = False  # whether nothing but the team's word is missing
+    _lasting_since: float | None = None  # of the condition that must last [s]
 
     def step(self, time: float, inputs: Inputs) -> State:
         """Advance by one tick; return the state to act in."""

@@ -45,11 +45,11 @@ class MonotonicClock(Clock):
             select.select(files, [], [], remaining)
 
 
+@dataclass
 class ManualClock(Clock):
     """A clock that is where it was put: for tests and replay."""
 
-    def __init__(self, start: float = 0.0) -> None:  # [s]
-        self.time = start
+    time: float = 0.0  # [s]
 
     def now(self) -> float:
         return self.time

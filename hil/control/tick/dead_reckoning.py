@@ -1,6 +1,7 @@
 """The state of a vehicle whose poses have stopped, until it is level."""
 
 import math
+from dataclasses import dataclass
 
 from hil.control.tick.body_estimate import Estimate
 from hil.links.backends.base import Command
@@ -12,21 +13,15 @@ RESPONSE = 0.05  # time constant with which body rates follow their command [s]
 ROUNDING = 1e-6  # tolerance of differences of times [s]
 
 
+@dataclass
 class DeadReckoning:
-    """An estimate that carries the last pose on by thrust and body rates.
+    """An estimate that carries the last pose on by thrust and body rates."""
 
-    Attributes:
-        state: of the vehicle at the last tick; None before the first pose with an attitude.
-        duration: for which it has been carried on [s].
-    """
-
-    def __init__(self) -> None:
-        """Wait for the first pose."""
-        self.state: BodyState | None = None
-        self.duration = 0.0
-        self._arrival = 0.0  # of the last pose [s]
-        self._time = 0.0  # that the state stands for [s]
-        self._reported: tuple[float, ...] | None = None
+    state: BodyState | None = None  # at the last tick; None before the first pose with an attitude
+    duration: float = 0.0  # for which it has been carried on [s]
+    _arrival: float = 0.0  # of the last pose [s]
+    _time: float = 0.0  # that the state stands for [s]
+    _reported: tuple[float, ...] | None = None
 
     def update(
         self, estimate: Estimate, rates: tuple[float, ...] | None, command: Command, mass: float

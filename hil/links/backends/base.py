@@ -106,10 +106,8 @@ class DryRun(Backend):
     """Sends nothing; counts what it was given."""
 
     name = "dry-run"
-
-    def __init__(self) -> None:
-        self.commands = self.releases = 0
-        self._release = IDLE
+    commands = releases = 0
+    _release = IDLE
 
     def status(self, host_time: float) -> Status:
         return Status(True, "dry run", self._release)
