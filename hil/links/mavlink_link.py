@@ -21,6 +21,7 @@ from visthrow.common.rotations import quat_of_euler, rotate_one
 
 LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
 BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
+POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY")
 NAN_QUATERNION = (math.nan,) * 4
 
 # type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently
@@ -165,14 +166,15 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in
     another frame than LOCAL_NED or LOCAL_FRD."""
     kind = message.get_type()
+    if kind not in POSE_MESSAGES:
+        return None
+    pos = (message.x, message.y, message.z)
     if kind == "ATT_POS_MOCAP":
-        pos = (message.x, message.y, message.z)
         return Pose(message.time_usec / 1e6, arrival, body, pos, tuple(message.q))
     if kind == "VISION_POSITION_ESTIMATE":
-        pos = (message.x, message.y, message.z)
         quat = quaternion_from_euler(message.roll, message.pitch, message.yaw)
         return Pose(message.usec / 1e6, arrival, body, pos, quat, reset=message.reset_counter)
-    if kind != "ODOMETRY" or message.frame_id not in LOCAL_FRAMES:
+    if message.frame_id not in LOCAL_FRAMES:
         return None
     quat = tuple(message.q)
     vel = _known((message.vx, message.vy, message.vz))
@@ -181,7 +183,6 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
     rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))
-    pos = (message.x, message.y, message.z)
     return Pose(
         message.time_usec / 1e6,
         arrival,

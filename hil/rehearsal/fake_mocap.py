@@ -49,13 +49,13 @@ class Mocap:
         self._next += 1.0 / self.params.rate
         p = self.params
         rng = self._rng
-        names = ("pos_w", "payload_pos_w", "quat_wb")
-        noise = dict(
-            zip(names, (p.position_noise, p.position_noise, math.radians(p.angle_noise_deg)))
-        )
-        vehicle, payload, quat = measured(
-            {name: truth[name][None].astype(float) for name in names}, noise, rng
-        ).values()
+        noise = {
+            "pos_w": p.position_noise,
+            "payload_pos_w": p.position_noise,
+            "quat_wb": math.radians(p.angle_noise_deg),
+        }
+        exact = {name: truth[name][None].astype(float) for name in noise}
+        vehicle, payload, quat = measured(exact, noise, rng).values()
         lost = rng.random(2) < p.loss
         bodies = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
         poses = [

@@ -26,7 +26,7 @@ from hil.links.backends.betaflight import (
     SETTINGS,
     STICKS,
 )
-from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
+from hil.links.backends.rates import MIDDLE, RATES_TYPES, TRAVEL, RatesParams, Sticks
 from hil.links.facts import values
 from tests.fakes.ports import ListeningPort, PortFake
 
@@ -53,6 +53,12 @@ SIZES = {
     msp.FACTS["MSP_RX_CONFIG"]: 7,
     msp.FACTS["MSP_FAILSAFE_CONFIG"]: 8,
 }  # bytes of the answers that tell settings
+
+
+def rate_at(rates: RatesParams, axis: int, us: float) -> float:
+    """Return the body rate [rad/s] about our axis at a stick's position [us]."""
+    stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
+    return Sticks.SIGNS[axis] * rates.rate(axis, stick)
 
 
 class FakeBetaflight(PortFake):
@@ -105,7 +111,7 @@ class FakeBetaflight(PortFake):
         three = (
             [int(p[f"{axis}_{what}"]) for axis in axes] for what in ("rc_rate", "rate", "expo")
         )
-        self._sticks = Sticks(RatesParams(kinds[int(p["rates_type"])], *map(tuple, three)))
+        self._rates = RatesParams(kinds[int(p["rates_type"])], *map(tuple, three))
 
     def came(self, data: bytes) -> None:
         for frame in self.parser.parse(data):
@@ -178,7 +184,7 @@ class FakeBetaflight(PortFake):
             self.witness.command(self.plant.time, (float("nan"),) * 4)
             return
         roll, pitch, yaw, throttle = (channels[at] for at in ORDER)
-        rates = tuple(self._sticks.rate(i, us) for i, us in enumerate((roll, pitch, yaw)))
+        rates = tuple(rate_at(self._rates, i, us) for i, us in enumerate((roll, pitch, yaw)))
         share = min(max((throttle - MINIMUM) / (HIGH - MINIMUM), 0.0), 1.0)
         idle = throttle <= MINIMUM
         back = self.plant.time - self._heard > IDLE_AFTER

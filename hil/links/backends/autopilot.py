@@ -10,12 +10,20 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from hil.links.backends.audit import Audit, Rule, rules_of
-from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Command, Release
-from hil.links.backends.thrust_curve import HoverThrustParams
+from hil.links.backends.base import (
+    FOLLOW,
+    HOLD,
+    LAND,
+    WAIT,
+    Autopilot,
+    Command,
+    Release,
+    VehicleParams,
+)
 from hil.links.mavlink_link import Link, attitude_target, command_long, parameter_request
 from hil.links.pymav import mav
 from hil.links.roster import Announce, MavlinkId, Party
-from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+from visthrow.config.bounds import Bound, Positive
 
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
 # for which a new heartbeat, which shows whether the pilot has taken over, is waited for before
@@ -46,14 +54,11 @@ CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
 @dataclass(frozen=True)
-class AutopilotParams(Bounded):
+class AutopilotParams(VehicleParams):
     """A vehicle that speaks MAVLink."""
 
     system: MavlinkId  # MAVLink id of the vehicle
     component: MavlinkId  # of its autopilot
-    thrust: HoverThrustParams
-    mechanism_lag: NotNegative  # from the release command to separation [s]
-    release_timeout: Positive  # without a final answer the release has failed [s]
     heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]
     # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it
     # over
@@ -75,6 +80,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     holds = True
+    params: AutopilotParams
 
     def __init__(
         self,

@@ -6,8 +6,10 @@ from time import perf_counter
 from typing import Any
 
 from hil.links.backends.audit import Audit
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port
 from hil.links.roster import Address, Announce, Roster, address_text
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 # how far a release has come
 IDLE = "idle"
@@ -46,6 +48,24 @@ class Status:
     thrust: float | None = None
     # body rates that it last reported [rad/s], x forward, y left, z up; None: it reports none
     rates: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True)
+class VehicleParams(Bounded):
+    """What every vehicle on the other side has."""
+
+    thrust: HoverThrustParams
+    mechanism_lag: NotNegative  # from the release command to separation [s]
+    release_timeout: Positive  # without a final answer the release has failed [s]
+
+
+@dataclass(frozen=True)
+class PortVehicleParams(VehicleParams):
+    """A vehicle on a port of its own."""
+
+    device: str  # see hil.links.device
+    remote: bool  # whether the device may leave this machine
+    silence: Positive  # after which it counts as lost [s]
 
 
 class Backend:
@@ -103,21 +123,18 @@ class Backend:
 
 
 class DryRun(Backend):
-    """Sends nothing; counts what it was given."""
+    """Sends nothing."""
 
     name = "dry-run"
-    commands = releases = 0
     _release = IDLE
 
     def status(self, host_time: float) -> Status:
         return Status(True, "dry run", self._release)
 
     def send(self, command: Command, host_time: float) -> bool:
-        self.commands += 1
         return True
 
     def release(self, when: float) -> None:
-        self.releases += 1
         self._release = ACCEPTED
 
     def rearm(self) -> None:
@@ -239,7 +256,7 @@ class Autopilot(Backend):
 
     audit = Audit()
     release_record: Release
-    params: Any
+    params: VehicleParams
     share: float | None = None
     voltage: float | None = None
     rates: tuple[float, ...] | None = None
@@ -292,22 +309,21 @@ class OnPort(Autopilot):
     for. ``dropped`` counts packets that could not be sent, ``roster`` what came and was refused."""
 
     protocol = ""
+    params: PortVehicleParams
 
-    def __init__(self, port: Port, silence: float, tell: Announce = None) -> None:
-        """Take an open port; after a silence [s] the controller counts as lost. ``tell`` is handed
-        who is refused.
-        """
+    def __init__(self, port: Port, params: PortVehicleParams, tell: Announce = None) -> None:
+        """Take an open port; ``tell`` is handed who is refused."""
         super().__init__()
+        self.params = params
         self.roster = Roster(tell=tell)
         self._port = port
-        self._silence = silence
         self._heard = -1e9
         self.dropped = 0
         self._taken = self._raised = self._over = False  # asked for; has followed; over
 
     def _note(self, host_time: float) -> tuple[str, str]:
         silence = host_time - self._heard
-        if silence <= self._silence:
+        if silence <= self.params.silence:
             return self._judge()
         return (
             f"no answer by {self.protocol}"

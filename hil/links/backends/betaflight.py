@@ -29,15 +29,15 @@ from hil.links.backends.base import (
     WAIT,
     Command,
     OnPort,
+    PortVehicleParams,
     Release,
 )
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
-from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import values
 from hil.links.roster import Announce
 from visthrow.common.errors import ConfigError
-from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+from visthrow.config.bounds import Bound
 
 FACTS = values("betaflight")
 # permanent ids of flight modes
@@ -87,12 +87,9 @@ AXES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
-class BetaflightParams(Bounded):
-    """The vehicle on the other side."""
+class BetaflightParams(PortVehicleParams):
+    """The vehicle on the other side of MSP."""
 
-    device: str  # of MSP, see hil.links.device
-    remote: bool  # whether the device may leave this machine
-    thrust: HoverThrustParams
     rates: RatesParams
     minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
     # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
@@ -100,9 +97,6 @@ class BetaflightParams(Bounded):
     release_channel: Annotated[int, Bound(1, 12)]  # AUX that opens the mechanism, from 1
     servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: int  # there, with the mechanism open [us]
-    mechanism_lag: NotNegative  # from the AUX's change to separation [s]
-    release_timeout: Positive  # without a read-back the release has failed [s]
-    silence: Positive  # after which the flight controller counts as lost [s]
     audit: bool  # read settings at connect and refuse to fly on a mismatch
 
     def __post_init__(self) -> None:
@@ -118,6 +112,7 @@ class Betaflight(OnPort):
 
     name = "betaflight"
     protocol = "MSP"
+    params: BetaflightParams
 
     def __init__(
         self,
@@ -129,8 +124,7 @@ class Betaflight(OnPort):
         """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are
         written or not.
         """
-        super().__init__(port, params.silence)
-        self.params = params
+        super().__init__(port, params)
         self.parser = msp.FrameParser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)

@@ -16,9 +16,17 @@ from dataclasses import dataclass
 
 from hil.links import crtp
 from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, rules_of
-from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Command, OnPort, Release
+from hil.links.backends.base import (
+    ACCEPTED,
+    FOLLOW,
+    PENDING,
+    WAIT,
+    Command,
+    OnPort,
+    PortVehicleParams,
+    Release,
+)
 from hil.links.backends.crazyflie_gyro import GyroStream
-from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import facts, values
 from hil.links.roster import Announce
@@ -26,7 +34,6 @@ from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
 from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
-from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 FACTS = values("crazyflie")
 # parameters that are set before it is armed
@@ -47,18 +54,13 @@ BLOCKS = {
 
 
 @dataclass(frozen=True)
-class CrazyflieParams(Bounded):
-    """The vehicle on the other side."""
+class CrazyflieParams(PortVehicleParams):
+    """The vehicle on the other side of CRTP; its device: radio://0/80/2M/E7E7E7E7E7, usb://0, or
+    udpout:127.0.0.1:19850 of its software in the loop.
+    """
 
-    # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
-    device: str
-    remote: bool  # whether a network device may leave this machine
-    thrust: HoverThrustParams
     # of eight bits that opens the mechanism at 1: group.name of an app or a deck
     release_parameter: str
-    mechanism_lag: NotNegative  # from the parameter's change to separation [s]
-    release_timeout: Positive  # without an answer the release has failed [s]
-    silence: Positive  # after which it counts as lost [s]
     external_pose: bool = True  # send the vehicle's poses to its estimator
 
     def __post_init__(self) -> None:
@@ -78,11 +80,11 @@ class Crazyflie(OnPort):
 
     name = "crazyflie"
     protocol = "CRTP"
+    params: CrazyflieParams
 
     def __init__(self, port: Port, params: CrazyflieParams, tell: Announce = None) -> None:
         """Speak CRTP on an open port; ``tell`` is handed the settings and who is refused."""
-        super().__init__(port, params.silence, tell)
-        self.params = params
+        super().__init__(port, params, tell)
         self.release_record = Release(params.release_timeout)
         self.poses = 0
         self.audit = Audit(self._rules(), self._ask, None, tell)

@@ -88,10 +88,3 @@ class Sticks:
         above = min(bisect_left(table, size), TRAVEL)
         index = above if above == 0 or table[above] - size <= size - table[above - 1] else above - 1
         return MIDDLE + int(math.copysign(index, self.SIGNS[axis] * rate))
-
-    def rate(self, axis: int, us: float) -> float:
-        """Return the body rate [rad/s] about our axis at a position [us]."""
-        stick = min(max((us - MIDDLE) / TRAVEL, -1.0), 1.0)
-        return self.SIGNS[axis] * math.copysign(
-            self._tables[axis][round(abs(stick) * TRAVEL)], stick
-        )
