@@ -5,16 +5,18 @@ release, without it; the policy learns neither. Batched over vehicles; the same 
 one on board."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy import ndarray
 
+from camera.field_bounds import Bound, BoundedFields, NotNegative
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 
 
 @dataclass(frozen=True)
-class HoverParams:
+class HoverParams(BoundedFields):
     """Gains and limits, chosen on the full simulator of the paper's vehicle.
 
     The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) lies
@@ -26,32 +28,25 @@ class HoverParams:
     Raises ValueError if a gain or limit is negative, or the thrust limits are not ordered.
     """
 
-    position_gain: float = 1.5  # velocity asked for a metre off [1/s]
-    velocity_gain: float = 3.5  # [1/s]
-    integral_gain: float = 3.0  # [1/s^3]
-    integral_limit: float = 1.5  # of each component [m/s^2]
-    integral_radius: float = 0.3  # distance from the goal within which the integral grows [m]
-    max_speed: float = 1.5  # of the velocity asked for [m/s]
-    max_acceleration: float = 6.0  # up and down, asked for besides gravity [m/s^2]
-    max_tilt: float = 0.6  # of the thrust asked for [rad]
-    attitude_gain: float = 9.0  # [1/s]
-    yaw_gain: float = 2.0  # [1/s]
-    max_rate: tuple[float, float, float] = (8.0, 8.0, 2.0)  # [rad/s]
-    min_thrust: float = 0.2  # [N]
-    max_thrust: float = 14.0  # [N]
+    position_gain: NotNegative = 1.5  # velocity asked for a metre off [1/s]
+    velocity_gain: NotNegative = 3.5  # [1/s]
+    integral_gain: NotNegative = 3.0  # [1/s^3]
+    integral_limit: NotNegative = 1.5  # of each component [m/s^2]
+    integral_radius: NotNegative = 0.3  # distance from the goal within which the integral grows [m]
+    max_speed: NotNegative = 1.5  # of the velocity asked for [m/s]
+    max_acceleration: NotNegative = 6.0  # up and down, asked for besides gravity [m/s^2]
+    max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the thrust asked for [rad]
+    attitude_gain: NotNegative = 9.0  # [1/s]
+    yaw_gain: NotNegative = 2.0  # [1/s]
+    max_rate: tuple[NotNegative, NotNegative, NotNegative] = (8.0, 8.0, 2.0)  # [rad/s]
+    min_thrust: NotNegative = 0.2  # [N]
+    max_thrust: NotNegative = 14.0  # [N]
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if np.any(np.asarray(value) < 0.0):
-                raise ValueError(f"{name} is {value}; expected 0 or more")
+        super().__post_init__()
         if not self.min_thrust < self.max_thrust:
             raise ValueError(
                 f"min_thrust {self.min_thrust} N is not below max_thrust {self.max_thrust} N"
-            )
-        if not self.max_tilt < np.pi / 2:
-            raise ValueError(
-                f"max_tilt {self.max_tilt} rad; expected less than pi/2, thrust must hold the"
-                " weight"
             )
 
 

@@ -75,15 +75,12 @@ class Policy:
     def __post_init__(self) -> None:
         expect_known([self.activation], ACTIVATIONS, "activation '{}'", PolicyError)
         _check_shapes(self)
-        for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
+        for part, dimension in (("observation", self.obs_dim), ("action", self.action_dim)):
             section = self.contract.get(part)
-            if isinstance(section, Mapping):
-                dimension = section.get("dimension", declared)
-            else:
-                dimension = declared
-            if dimension != declared:
+            stated = section.get("dimension") if isinstance(section, Mapping) else None
+            if stated not in (None, dimension):
                 raise PolicyError(
-                    f"the contract says {part} dimension {dimension}, the network has {declared}"
+                    f"the contract says {part} dimension {stated}, the network has {dimension}"
                 )
 
     @property

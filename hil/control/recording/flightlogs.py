@@ -7,6 +7,7 @@ poses. Separation and landing come from the payload's own poses."""
 import json
 import math
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -219,12 +220,8 @@ def _meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> di
 
 def events(ticks: list[Tick]) -> list[list]:
     """Return time, state and reason of each change."""
-    changes: list[list] = []
-    for tick in ticks:
-        change = [tick.line["time"], tick.decision.state, tick.decision.reason]
-        if not changes or changes[-1][1:] != change[1:]:
-            changes.append(change)
-    return changes
+    same = groupby(ticks, lambda tick: (tick.decision.state, tick.decision.reason))
+    return [[next(group).line["time"], *change] for change, group in same]
 
 
 def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
