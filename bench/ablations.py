@@ -25,13 +25,14 @@ from bench.loop import PLANT, add_arguments, explained, named, recorded
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog, FlightRecorder
 from visthrow.task import load_experiment, plant_of
-from visthrow.throws.flight_loop import Flight, Phase, Policies, hover
+from visthrow.throws.flight_loop import Decision, Flight, FlightObserver, Phase, Policies, hover
 from visthrow.throws.loading import Loaded, load_policy
-from visthrow.throws.plants import make_plant
-from visthrow.throws.recorded import LogRecorder
+from visthrow.throws.plants import Snapshot, make_plant
 from visthrow.throws.reference_protocol import place_in_hover
+
+POSES = ("pos_w", "quat_wb", "payload_pos_w")  # channels that are recorded
 
 LACKS = {
     "no_aerodynamics": "aerodynamics",
@@ -153,6 +154,21 @@ class Ablations:
         return record | {"held": json.loads(kept.read_text())}
 
 
+class FlightLogs(FlightObserver):
+    """A recorder of each vehicle: poses and commands at the beginning of each period."""
+
+    def __init__(self, count: int, meta: dict[str, Any]) -> None:
+        self.recorders = [FlightRecorder(meta) for _ in range(count)]
+
+    def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
+        state = flight.now
+        for e, recorder in enumerate(self.recorders):
+            poses = {name: getattr(state, name)[e] for name in POSES}
+            recorder.add(state.time, **poses)
+            release = float(sent.release[e])
+            recorder.add(state.time, command=sent.command[e], release_command=release)
+
+
 def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> list[FlightLog]:
     """Throw at goals, one vehicle each, side by side: one vehicle costs nearly as much as thirty.
 
@@ -176,7 +192,7 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     rng = np.random.default_rng(seed)
     home = place_in_hover(plant, loaded.experiment, rng)
     meta = {"policy": loaded.name, "plant": plant.name}
-    recording = LogRecorder(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
+    recording = FlightLogs(len(goals_w), meta)
     flight = Flight(plant, Policies([loaded], goals_w), recording, home)
     landed = 0
 

@@ -1,8 +1,6 @@
-"""Recorded throws: one from hover to the vehicle hovering again, and what any flight is recorded
-by.
-"""
+"""Recorded throws: from hover to the vehicle hovering again."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,49 +29,31 @@ MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "pa
 """Channels recorded a second time as measured, under ``measured_<name>``, stamped when they were
 true, with their units.
 """
+TRUTH = (*MEASURED, "payload_vel_w", "motor_speed", "battery_voltage", "attached")
+"""Channels of what is true."""
 
 
-class LogRecorder(FlightObserver):
-    """A flight log of each vehicle, ``recorders``: what is true at each period's beginning, and
-    what is sent then.
-    """
-
-    def __init__(self, names: Sequence[str], count: int, meta: dict[str, Any]) -> None:
-        """Start empty, with standard channels that a snapshot has."""
-        self.names = names
-        self.recorders = [FlightRecorder(meta) for _ in range(count)]
-
-    def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
-        state = flight.now
-        for e, recorder in enumerate(self.recorders):
-            recorder.add(state.time, **{name: getattr(state, name)[e] for name in self.names})
-            recorder.add(
-                state.time, command=sent.command[e], release_command=float(sent.release[e])
-            )
-
-
-class _Full(LogRecorder):
-    """Everything of one vehicle: the rope down to the ground, what the camera sees, and when the
-    release was asked for, ``latch`` [s].
+class ThrowRecorder(FlightObserver):
+    """A flight log of one vehicle: what is true at each period's beginning, what is sent then, the
+    rope down to the ground, what the camera sees, and when the release was asked for, ``latch``
+    [s].
     """
 
     def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
-        truth = ("payload_vel_w", "motor_speed", "battery_voltage", "attached")
-        super().__init__((*MEASURED, *truth), 1, meta)
+        self.recorder = FlightRecorder(meta)
         self.pilots = pilots
         self.latch: float | None = None
         for name, unit in MEASURED.items():
-            self.recorders[0].declare(
-                f"measured_{name}", unit, "body" if name == "rate_b" else "world"
-            )
+            self.recorder.declare(f"measured_{name}", unit, "body" if name == "rate_b" else "world")
         self._resting: LooseRope | None = None
         self._before: Snapshot | None = None
         self._sampled = -np.inf  # stamp of the last measured sample [s]
 
     def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
-        super().before(flight, snapshot, sent)
-        recorder = self.recorders[0]
         state = flight.now
+        self.add_truth(state)
+        recorder = self.recorder
+        recorder.add(state.time, command=sent.command[0], release_command=float(sent.release[0]))
         throws = sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = state.time
@@ -87,17 +67,21 @@ class _Full(LogRecorder):
             recorder.add(state.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)
 
+    def add_truth(self, state: Snapshot) -> None:
+        """Record what is true."""
+        self.recorder.add(state.time, **{name: getattr(state, name)[0] for name in TRUTH})
+
     def sample(self, flight: Flight) -> None:
         """Record the rope now, and the measured state that the pilot was given last, stamped when
         it was true.
         """
         points = self._rope(flight)
         points[:, 2] = np.maximum(points[:, 2], ROPE_ON_GROUND)
-        self.recorders[0].add(flight.now.time, cable_points_w=points)
+        self.recorder.add(flight.now.time, cable_points_w=points)
         sample = flight.plant.sample
         if sample.time > self._sampled:
             values = {f"measured_{name}": getattr(sample, name)[0] for name in MEASURED}
-            self.recorders[0].add(sample.time, **values)
+            self.recorder.add(sample.time, **values)
             self._sampled = sample.time
         self._before = flight.now
 
@@ -157,7 +141,7 @@ def fly(
     place = home[None] + START_SPREAD * rng.uniform(-1, 1, (1, 3))
     plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, START_SWING))
     pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True, eyes=eyes)
-    recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
+    recording = ThrowRecorder(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
 
     def hangs_still(snapshot: Snapshot) -> bool:
@@ -222,12 +206,12 @@ def _hovering(
     return Phase(False, finished)
 
 
-def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
+def _finished(flight: Flight, recording: ThrowRecorder, recovery: float) -> FlightLog:
     """Return the log with the last state, and how the throw ended."""
     plant = flight.plant
     state = flight.now
-    recorder = recording.recorders[0]
-    recorder.add(state.time, **{name: getattr(state, name)[0] for name in recording.names})
+    recorder = recording.recorder
+    recording.add_truth(state)
     plant.measured()
     recording.sample(flight)
     landing = plant.landing

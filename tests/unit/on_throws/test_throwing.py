@@ -28,7 +28,7 @@ from visthrow.throws.flight_loop import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
-from visthrow.throws.recorded import _Full, fly
+from visthrow.throws.recorded import ThrowRecorder, fly
 from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
@@ -209,7 +209,7 @@ def test_a_flight_goes_from_hover_to_hover(flown):
 
 def test_a_rope_keeps_its_speed_when_the_ball_lands():
     """A rope that stands on the ball and tips over goes on tipping for 10 ms."""
-    recording, height = _Full(None, {}), np.linspace(0.5, 0.1, 5)
+    recording, height = ThrowRecorder(None, {}), np.linspace(0.5, 0.1, 5)
     upright, leaning = (
         np.column_stack((lean * height, 0.0 * height, height)) for lean in (0, 0.02)
     )
