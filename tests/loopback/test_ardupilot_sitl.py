@@ -64,7 +64,7 @@ def bridge(monkeypatch):
 
 
 def fly(bridge, frames):
-    other = OtherSide(frames, bridge.port.getsockname())
+    other = OtherSide(frames, bridge.port._open.getsockname())
     other.start()
     bridge.paced = True  # it was heard: its next frame is waited for
     for _ in frames:

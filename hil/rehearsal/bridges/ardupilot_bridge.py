@@ -15,15 +15,13 @@ Source: ardupilot, libraries/SITL/examples/JSON/readme.md, libraries/SITL/SIM_JS
 
 import json
 import select
-import socket
 import struct
 from typing import Any
 
 import numpy as np
 
-from hil.errors import LinkError
 from hil.links.backends.ardupilot import ArduPilotParams
-from hil.links.device import LARGEST_DATAGRAM
+from hil.links.device import Device, UdpPort
 from hil.links.facts import values
 from hil.rehearsal.bridges.betaflight_bridge import MotorPlant
 from hil.rehearsal.fake import Bridge
@@ -86,29 +84,19 @@ class ArduPilotSitl(Bridge):
     params: ArduPilotParams
 
     def connect(self, autopilot: None) -> None:
-        """Listen for ArduPilot. Raises `LinkError`: the port is taken."""
+        """Listen for ArduPilot; raises `LinkError` where the port is taken."""
         self._number = -1
         self.motors = np.zeros(4)
         self.frames = 0
         self.repeated = 0
         self.restarts = 0
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind(("127.0.0.1", SERVOS))
-        except OSError as error:
-            self._socket.close()
-            raise LinkError(
-                f"cannot listen on udp port {SERVOS}: {error.strerror}; ArduPilot looks for its"
-                " simulation there"
-            ) from error
-        self._socket.setblocking(False)
-        self.port = self._socket
+        self.port = UdpPort(Device("udp", "127.0.0.1", SERVOS))
 
     def fly(self) -> None:
         """Fly a period by the next frame's outputs, and the state after it in answer; without a
         frame, a period as it was.
         """
-        frame, address = self._frame()
+        frame = self._frame()
         self.paced = frame is not None
         if frame is None:
             super().fly()
@@ -127,15 +115,14 @@ class ArduPilotSitl(Bridge):
                 0 <= index < len(servos) and abs(servos[index] - opens) <= ARRIVED, self.plant.time
             )
             super().fly()
-        self._socket.sendto(state_line(self.plant.time, self.plant), address)
+        self.port.write(state_line(self.plant.time, self.plant), self.port.sender)
 
-    def _frame(self) -> tuple[tuple[int, np.ndarray] | None, Any]:
-        while select.select([self._socket], [], [], PATIENCE if self.paced else 0.0)[0]:
-            packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
-            frame = outputs(packet)
+    def _frame(self) -> tuple[int, np.ndarray] | None:
+        while select.select([self.port], [], [], PATIENCE if self.paced else 0.0)[0]:
+            frame = outputs(self.port.read() or b"")
             if frame is not None:
-                return frame, sender
-        return None, None
+                return frame
+        return None
 
     def flown(self) -> np.ndarray:
         return self.motors
@@ -152,4 +139,4 @@ class ArduPilotSitl(Bridge):
 
     def close(self) -> None:
         super().close()
-        self._socket.close()
+        self.port.close()
