@@ -8,10 +8,9 @@ Source: `hil.links.facts`, crazyflie; cflib, crtp/udpdriver.py."""
 
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 from hil.errors import LinkError
-from hil.links.device import check_device, open_port
+from hil.links.device import Port, check_device, open_port
 from hil.links.facts import values
 from visthrow.common.extras import load_extra
 
@@ -99,12 +98,10 @@ def ask_protocol() -> bytes:
     return message("port_platform", "channel_version", bytes([FACTS["ask_protocol"]]))
 
 
-class CflibPort:
-    """A radio or USB link of cflib; a `hil.links.device.Port`."""
+class CflibPort(Port):
+    """A radio or USB link of cflib."""
 
     whole = True
-    sender = None
-    peer = None
 
     def __init__(self, address: str) -> None:
         """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""
@@ -115,10 +112,10 @@ class CflibPort:
         self.lost: str | None = None
         try:
             crtp.init_drivers()
-            self._link: Any = crtp.get_link_driver(address, None, self._lose)
+            self._open = crtp.get_link_driver(address, None, self._lose)
         except Exception as error:  # USB, and the package's own
             raise LinkError(f"cannot open {address}: {error}") from error
-        if self._link is None:
+        if self._open is None:
             raise LinkError(
                 f"cannot open {address}: no driver of cflib takes it; expected"
                 f" {', '.join(CFLIB)}..."
@@ -128,24 +125,21 @@ class CflibPort:
         self.lost = message
 
     def read(self) -> bytes | None:
-        packet = self._link.receive_packet(0)
+        packet = self._open.receive_packet(0)
         return None if packet is None else bytes([packet.header]) + bytes(packet.data)
 
     def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         packet = self._packet(data[0])
         packet.data = data[1:]
-        self._link.send_packet(packet)
+        self._open.send_packet(packet)
         return self.lost is None
 
     def fileno(self) -> int:
         """Return -1: its packets come by a thread; nothing can be waited for."""
         return -1
 
-    def close(self) -> None:
-        self._link.close()
 
-
-def open_crtp(device: str, remote: bool) -> Any:
+def open_crtp(device: str, remote: bool) -> Port:
     """Open the port of a device; raises `LinkError` where it is refused, or cannot be opened."""
     return (
         CflibPort(device)

@@ -14,7 +14,7 @@ import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from hil.errors import LinkError
 from visthrow.common.extras import load_extra
@@ -73,26 +73,31 @@ def check_device(text: str, *, remote: bool = False) -> Device:
     return Device(match[1], host, port)
 
 
-class Port(Protocol):
+class Port:
     """A port for bytes in and out; neither call waits."""
 
-    whole: bool  # whether each chunk is a whole datagram
-    sender: tuple[str, int] | None  # of the last chunk; None on a stream, which has one peer
-    peer: tuple[str, int] | None  # that the device names; None where it names none
+    whole = False  # whether each chunk is a whole datagram
+    sender: tuple[str, int] | None = None  # of the last chunk; None on a stream, which has one peer
+    peer: tuple[str, int] | None = None  # that the device names; None where it names none
+    _open: Any
 
     def read(self) -> bytes | None:
         """Return the next chunk; None where there is none."""
+        raise NotImplementedError
 
     def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         """Return whether the bytes were taken; on UDP for an address, where the device does not
         name it.
         """
+        raise NotImplementedError
 
     def fileno(self) -> int:
         """Return what can be waited for until there is something to read."""
+        return self._open.fileno()
 
     def close(self) -> None:
         """Give the port back."""
+        self._open.close()
 
 
 def chunks(
@@ -111,18 +116,6 @@ def chunks(
             continue
         looked += 1
         yield data
-
-
-class _Opened:
-    """The open end of a port."""
-
-    _open: Any
-
-    def fileno(self) -> int:
-        return self._open.fileno()
-
-    def close(self) -> None:
-        self._open.close()
 
 
 def refused(port: str, number: int, error: OSError, option: str = "") -> LinkError:
@@ -149,7 +142,7 @@ def refused(port: str, number: int, error: OSError, option: str = "") -> LinkErr
     )
 
 
-class UdpPort(_Opened):
+class UdpPort(Port):
     """A UDP socket; one that listens hears everybody, and says who sent what."""
 
     whole = True
@@ -163,7 +156,6 @@ class UdpPort(_Opened):
         self._open = socket.socket(family, socket.SOCK_DGRAM)
         self._open.setblocking(False)
         self.peer = (device.host, device.port) if device.kind == "udpout" else None
-        self.sender: tuple[str, int] | None = None
         try:
             if device.kind == "udp":
                 self._open.bind((device.host, device.port))
@@ -189,12 +181,9 @@ class UdpPort(_Opened):
             return False
 
 
-class _Stream(_Opened):
+class _Stream(Port):
     """A stream of bytes to and from one peer."""
 
-    whole = False
-    sender = None
-    peer = None
     _get: Callable[[], bytes]
     _put: Callable[[bytes], int | None]
 
