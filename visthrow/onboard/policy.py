@@ -176,7 +176,7 @@ class Policy:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return all numbers by their names in the file."""
-        named = {}
+        named: dict[str, Tensor] = {}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             named |= {f"layer{i}_weight": weight, f"layer{i}_bias": bias}
         if self.mean is not None and self.std is not None:
