@@ -94,6 +94,7 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     hover = 0.01 * np.median(thrust)  # read as per cent; four of them carry the vehicle
     lift = 4.0 * found.flyer["thrust_map"][1] * hover
     assert lift == approx(9.81 * found.flyer["mass"], rel=0.1)
+    assert found.flyer["drag_xy"] == approx(0.3 * found.flyer["mass"], rel=0.05)  # or no wind acts
     assert any("The force follows 'motor_command' best" in q for q in found.questions)
 
 

@@ -22,6 +22,8 @@ from visthrow.logs.mapping import TableMap, TimeColumn
 from visthrow.logs.readers.table import Table, logs_of
 from visthrow.logs.unit_names import UNITS, fitting_units
 
+# of rotors, by mass; without any, wind would be told as a tilt (Faessler et al. 2018) [1/s]
+_DRAG = 0.3
 _TIMES = ("s", "ms", "us", "ns")
 _STEP = (2e-4, 0.25)  # between two rows of a log [s]
 
@@ -315,6 +317,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         "thrust_map": [float(f"{x:.4g}") for x in power],
         "reference_voltage": float(np.round(np.median(volts), 2)),
         "every": max(1, round(0.03 / float(np.median(np.diff(time))))),
+        "drag_xy": float(f"{_DRAG * whole * share:.2g}"),
         **NAMES["flyer"],
     }
     if length:
