@@ -37,6 +37,7 @@ AROUND = {
     "thrust": "real",
     "thrust_rate": "real",
     "tension": "real",
+    "neighbour_pos_w": "vec3",
 }
 """What factors are made of: name -> type."""
 
@@ -96,6 +97,11 @@ def tension(a: Any):
     return a.tension
 
 
+@wp.func
+def neighbour(a: Any):
+    return a.neighbour_pos_w
+
+
 STATES = {
     "pos_w": pos,
     "vel_w": vel,
@@ -108,6 +114,7 @@ STATES = {
     "thrust": thrust,
     "slope": thrust_rate,
     "tension": tension,
+    "neighbour_pos_w": neighbour,
 }
 """Quantities that a state holds."""
 
@@ -129,6 +136,11 @@ def saturated(vector: Any):
 
 
 @wp.func
+def scaled(factor: Any, vector: Any):
+    return factor * vector
+
+
+@wp.func
 def turn_rate(arm: Any, arm_vel: Any):
     return wp.cross(arm, arm_vel) / wp.dot(arm, arm)
 
@@ -143,6 +155,7 @@ OPERATIONS = {
     "sum": wp.add,
     "difference": wp.sub,
     "normal_part": normal_part,
+    "scaled": scaled,
     "inverse": inverse,
     "saturated": saturated,
     "turn_rate": turn_rate,
@@ -190,10 +203,15 @@ def _functions(rows):
     return {name: quantity(row[2]) for name, row in rows.items()}
 
 
-SCALARS = _functions(LAW_FACTORS["scalars"])
+MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds
+
+SCALARS = _functions(LAW_FACTORS["scalars"] | MEASURED["scalars"])
 """Scalars that a law may name."""
 
-VECTORS = {block: _functions(rows) for block, rows in LAW_FACTORS["vectors"].items()}
+VECTORS = {
+    block: _functions(rows | MEASURED["vectors"].get(block, {}))
+    for block, rows in LAW_FACTORS["vectors"].items()
+}
 """Vectors that a law of each block may name; forces in the world frame, torques in the body's."""
 
 BLOCKS = tuple(VECTORS)
@@ -204,16 +222,22 @@ def structure(laws: tuple[LawParams, ...]) -> tuple:
     return tuple((law.block, law.factors, law.vector) for law in laws)
 
 
-def check_laws(laws: tuple[LawParams, ...]) -> None:
-    """Raise ValueError for a law that no block can be made of."""
+def check_laws(laws: tuple[LawParams, ...], measured: bool = False) -> None:
+    """Raise ValueError for laws that no blocks can be made of.
+
+    ``measured``: whether what a log alone holds is there.
+    """
     if len(laws) > MOST_LAWS:
         raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
+    if measured:
+        return
     for law in laws:
-        vectors = VECTORS[law.block]
-        if law.vector not in vectors or not set(law.factors) <= set(SCALARS):
+        scalars = LAW_FACTORS["scalars"]
+        vectors = LAW_FACTORS["vectors"][law.block]
+        if law.vector not in vectors or not set(law.factors) <= set(scalars):
             raise ValueError(
                 f"law on {law.block}, {' '.join((*law.factors, law.vector))}: it takes a measured"
-                f" neighbour, which no simulation has; expected factors of {', '.join(SCALARS)} and"
+                f" neighbour, which no simulation has; expected factors of {', '.join(scalars)} and"
                 f" a vector of {', '.join(vectors)}"
             )
 
@@ -289,6 +313,8 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleName
             a.vel_w = s.vel_w
             a.rate_b = s.rate_b
             a.quat_wb = s.quat_wb
+            a.neighbour_pos_w = air.neighbour_pos_w
+            a.thrust_rate = air.thrust_rate
             f = flow(p, air, s, command)
             f0 = rotor_thrust_scaled(p, f.acting, s.voltage)
             f1 = rotor_thrust_scaled(p, f.acting + real(1.0e-3) * f.motor_speed, s.voltage)

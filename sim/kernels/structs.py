@@ -79,7 +79,8 @@ class Types:
         Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and
             what pushes from outside
             during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
-                mass, ``payload_push_w`` [N].
+                mass, ``payload_push_w`` [N]; for laws of a replay the measured
+                ``neighbour_pos_w`` [m], and ``thrust_rate`` [N/s] where commands are thrusts.
         Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
             an entry for one environment or all, and the numerics. rows: types of these arrays.
         Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.
@@ -100,6 +101,8 @@ class Types:
             "push_w": self.vec3,
             "twist_b": self.vec3,
             "payload_push_w": self.vec3,
+            "neighbour_pos_w": self.vec3,
+            "thrust_rate": real,
         }
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})

@@ -16,7 +16,7 @@ from sim.kernels import state as st
 from sim.kernels.laws import build_laws
 from sim.kernels.quadrotor.rigid_body import build_flow
 from sim.kernels.quadrotor.thrust import rotor_thrust
-from sim.kernels.replay.sampling import build_sampling
+from sim.kernels.replay.sampling import build_sampling, rotation_of_vector
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
@@ -110,6 +110,18 @@ DATA_FIELDS = {
     "gyro_time": "real",
 }
 
+IMPOSED_WINDOW = {"attitude_first": "int"}  # row of its first command's attitude
+IMPOSED_DATA = {
+    # of a command, beside it
+    "thrust_rate": "real",  # of all motors together [N/s]
+    # while a command acts: attitude when it begins to, and the rate at which that turns
+    "attitude": "quat",
+    "turn_b": "vec3",  # [rad/s]
+    "turn_acc_b": "vec3",  # by which a vehicle is turned besides what torques do [rad/s^2]
+    "neighbour_pos_w": "vec3",  # measured position of what may push the vehicle [m]
+}
+"""Further fields of a replay whose attitude is imposed."""
+
 
 @dataclass(frozen=True)
 class ReplayKernel:
@@ -169,6 +181,18 @@ def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
     elif m.slack != 0:
         out.slack = 0
         out.slack_last = t1
+    return out
+
+
+@wp.func
+def faced(s: Any, data: Any, row: int, middle: Any, h: Any):
+    """The vehicle at the start of a step of h seconds, turned so that it has the imposed attitude
+    in its ``middle`` [s after the row's start].
+    """
+    out = s
+    half = type(h)(0.5) * h
+    q = data.attitude[row] * rotation_of_vector(s.quat_wb, middle * data.turn_b[row])
+    out.quat_wb = q * rotation_of_vector(s.quat_wb, -half * s.rate_b)
     return out
 
 
@@ -255,22 +279,28 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
 
 
 def build_replay(
-    t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()
+    t: Types,
+    vehicle: VehicleParams,
+    segments: int,
+    laws: tuple[LawParams, ...] = (),
+    imposed: bool = False,
 ) -> ReplayKernel:
     """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
     numbers are read at run time.
-    """
+
+    ``imposed``: whether the vehicle takes recorded attitudes, whatever its torques are; its rates
+    are simulated beside them. Commands are motor speeds then."""
     real = t.real
     vec3 = t.vec3
     L = segments
     State = st.array_struct(t, "ReplayState", STATE_FIELDS)
-    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
+    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS | (IMPOSED_WINDOW if imposed else {}))
     Lanes = st.array_struct(t, "Lanes", LANE_FIELDS)
     Knots = st.array_struct(t, "Knots", KNOT_FIELDS)
-    Data = st.array_struct(t, "Recorded", DATA_FIELDS)
+    Data = st.array_struct(t, "Recorded", DATA_FIELDS | (IMPOSED_DATA if imposed else {}))
     Sensing = t.from_dataclass(SensingParams, {})
     Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
-    flow, advance = build_flow(t, vehicle, EVERYTHING)
+    flow, advance = build_flow(t, vehicle, EVERYTHING, motors=imposed)
     chain = build_chain(t, L, EVERYTHING)
     coupled = build_coupled_step(t, flow, advance, chain, EVERYTHING)
     extra = build_laws(t, laws, flow, chain)
@@ -384,6 +414,10 @@ def build_replay(
                 k.t0 = m.time + real(float(j)) * h
                 k.t1 = k.t0 + h
                 k.h = h
+                if wp.static(imposed):
+                    held = windows.attitude_first[w] + command - windows.command_first[w]
+                    middle = k.t0 + real(0.5) * h - data.command_time[command]
+                    m.quad = faced(m.quad, data, held, middle, h)
                 k.quad = m.quad
                 k.pay = m.pay
                 k.pay_vel = m.pay_vel
@@ -393,6 +427,11 @@ def build_replay(
                     hanging = 1
                     m.rope = chain.stretched(natural, m.rope, stiffness, u, h)
                 pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
+                if wp.static(imposed):
+                    twist = wp.cw_mul(p.body.inertia, data.turn_acc_b[held])
+                    pushed.twist_b = pushed.twist_b + twist
+                    pushed.neighbour_pos_w = data.neighbour_pos_w[held]
+                    pushed.thrust_rate = data.thrust_rate[command]
                 pushed = extra.on(p, m.rope, pushed, k.quad, n, u, stiffness, active, hanging)
                 if hanging != 0:
                     quad, total, _fell_back = coupled.step(

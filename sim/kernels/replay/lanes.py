@@ -83,6 +83,9 @@ class Replay:
         device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the
             same.
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
+        gravity: [m/s^2].
+        imposed: whether the recording holds the attitudes that the vehicles take, fields of
+            ``kernel.IMPOSED_DATA``; commands then are the motors' thrusts, at once.
     """
 
     def __init__(
@@ -91,6 +94,8 @@ class Replay:
         sensings: Sequence[SensingParams],
         device: str = "cpu",
         download: Callable[[wp.array], ndarray] = wp.array.numpy,
+        gravity: float = GRAVITY,
+        imposed: bool = False,
     ):
         first = plants[0]
         if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {
@@ -104,14 +109,15 @@ class Replay:
         self.segments = first.rope.segments
         self._sim = first.sim
         self._download = download
+        self._gravity = gravity
         self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
-        check_laws(first.laws)
-        key = (kinds_of(first.vehicle), self.segments, structure(first.laws))
+        check_laws(first.laws, measured=imposed)
+        key = (kinds_of(first.vehicle), self.segments, structure(first.laws), imposed)
         if key not in _BUILDS:
-            _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
+            _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws, imposed)
         self.kernel = _BUILDS[key]
         vehicles = [p.vehicle for p in plants]
-        self._rows = pack_plants(
+        self.rows = pack_plants(
             t,
             first,
             vehicles,
@@ -120,14 +126,22 @@ class Replay:
             [p.release for p in plants],
             [p.laws for p in plants],
         )
-        self._sensings = pack(self.kernel.Sensing, *sensings)
+        self.rows["sensings"] = pack(self.kernel.Sensing, *sensings)
         self._plants: dict[str, list] = {}
+
+    def of_rows(self, rows: dict[str, ndarray]) -> "Replay":
+        """Return the same replay with other parameters, structured arrays as in ``rows``."""
+        other = copy.copy(self)
+        other.rows = rows
+        other._plants = {}
+        return other
 
     def _plants_on(self, device: str) -> list:
         """Return plants and sensings on a device, copied once."""
         if device not in self._plants:
-            plants = plants_on(self.types, self._rows, self._sim, GRAVITY, device)
-            sensings = wp.array(self._sensings, dtype=self.kernel.Sensing, device=device)
+            rows = dict(self.rows)
+            sensings = wp.array(rows.pop("sensings"), dtype=self.kernel.Sensing, device=device)
+            plants = plants_on(self.types, rows, self._sim, self._gravity, device)
             self._plants[device] = [plants, sensings]
         return self._plants[device]
 

@@ -97,7 +97,7 @@ def simulator_of(
     if isinstance(model, ThrowModel):
         plant = apply(model.entries, model.setting, diagnosis.theta).plant
         adapted = copy
-    elif isinstance(model, FlyerModel) and isinstance(model.params, FlyerParams):
+    elif isinstance(model, FlyerModel):
         plant = vehicle_of(model.params, plant_of(load_experiment("state")))
         adapted = partial(carried, params=model.params)
     else:

@@ -3,221 +3,100 @@ attitude.
 
 Where the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity
 alone, whatever controller flies; where each motor's command is logged, the rates follow too. No
-controller has to be known."""
+controller has to be known. The simulator's replay flies it, with the attitude from the log."""
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.interpolate import CubicHermiteSpline
 
-from visthrow.common.rotations import cross, normal_part
-from visthrow.diagnose.models.catalogue import ModelEffect
-from visthrow.diagnose.models.law_terms import exerted
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.models.numeric import (
-    Lanes,
-    NumericModel,
-    Stretch,
-    halves,
-    integrate,
-    triangles,
-)
+from visthrow.common.rotations import multiply, normal_part, quat_of_vector, rotate, vectors_between
+from visthrow.diagnose.models.numeric import Lanes, Stretch, triangles
+from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, FlyerParams
+from visthrow.diagnose.models.quadrotor.flyer_plant import replay_of
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
     NEIGHBOUR,
-    expect_thrust,
-    lagged,
+    ROWS,
     spare,
     windows_of,
     without_each,
 )
-from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
-Slope = Callable[[int, ndarray], ndarray]
-"""Of the half step, and states or velocities of lanes."""
+SWINGING = 3  # steps a row where a payload swings below
+NEVER = 1e9  # after a start, when the cable is let go [s]
+# effects on the motors' thrust, and on the attitude that the vehicle takes
+OF_THRUST = (
+    *("cmd_delay", "motor_tau", "thrust_curve", "thrust_fade", "battery_sag", "thrust_gain"),
+    *(f"motor_{name}" for name in MOTORS),
+)
+OF_ATTITUDE = (
+    *("attitude_delay", "estimator_lean", "marker_rot_x", "marker_rot_y"),
+    *("frame_tilt_x", "frame_tilt_y"),
+)
 
-Quantities = Callable[[int, ndarray], dict[str, ndarray]]
-"""Of laws, by the half step and states of lanes."""
 
-SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
-BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # number of the latent block that a channel shows
-
-
-class FlyerModel(NumericModel):
+class FlyerModel(DrivenModel):
     """Windows of flights of one vehicle."""
 
     table = "flyer"
-    latent_step = 1e-2
-    knot_count = 8
-    # channels that are states, and which
-    columns: Mapping[str, slice] = {}
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """Cut the flights into windows.
-
-        Raises LogError where no log has the channels, or none flies.
-        """
-        self.describe(logs, params)
-        blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
-        self.pushes = [(block, axis) for block in blocks for axis in range(3)]
+        """See the base class."""
         super().__init__(logs, params)
-        self.steps = round(params.window / params.step)
-        self._spare = spare(params.step)
+        self.row = params.step / ROWS  # between commands of a flight [s]
+        self.rows = ROWS * self.steps
 
     def describe(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """Set the channels that are looked at, that drive the model, and that it needs."""
+        """See the base class."""
         optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
         simulated = [name for name, part in optional.items() if part is not None]
         self.channels = (params.position, *simulated)
         drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         self.inputs = (params.attitude, params.input, *drivers)
         self.needed = (params.position, params.attitude, params.input, *simulated)
-        turned = 6 if params.cable is None else 12
-        self.columns = {"rate_b": slice(turned, turned + 3)}
-
-    @property
-    def motors(self) -> int:
-        """Return the number of columns of the inputs."""
-        return self.stretches[0].data["sent"].values.shape[1]
-
-    @property
-    def has_voltage(self) -> bool:
-        """Whether all logs tell the battery's voltage."""
-        return "battery_voltage" in self.inputs
-
-    def catalogue(self) -> list[ModelEffect]:
-        """See the base class; where the voltage is logged, thrust fades with it."""
-        effects = super().catalogue()
-        return [e for e in effects if not (self.has_voltage and e.name == "thrust_fade")]
-
-    def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
-        """See the base class; at most ``most_windows``, spread evenly.
-
-        Raises LogError: commands are of another size than carries the vehicle.
-        """
-        stretches = super().cut(logs)
-        limit = self.params.most_windows
-        for name in ("battery_voltage", NEIGHBOUR):
-            count = sum(name in log for log in logs)
-            if 0 < count < len(logs):
-                note = f"{name} is not used: only {count} of {len(logs)} logs hold it"
-                self.notes = (*self.notes, note)
-        if stretches:
-            expect_thrust(stretches, self.params)
-        if len(stretches) <= limit:
-            return stretches
-        self.notes = (*self.notes, f"long flights: {limit} windows are looked at, spread over all")
-        chosen = np.linspace(0, len(stretches) - 1, limit).round().astype(int)
-        return [stretches[i] for i in chosen]
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
         return windows_of(self, log, number)
 
-    def _thrusts(self, lanes: Lanes) -> ndarray:
-        """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held
-        commands by the map, through a lag.
-
-        In the middle of a step stands what makes Simpson's rule, and so the integration, give the
-        step's own mean: commands switch there."""
-        p = self.params
-        grid = 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None]
-        delay = p.command_delay + self.size_of(lanes, "cmd_delay")
-        tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
-        columns = [lanes.owner, delay, np.maximum(tau, SHORTEST)]
-        distinct, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
-        thrust = np.empty((len(grid), len(lanes.owner), self.motors))
-        for number, (owner, late, lag) in enumerate(distinct):
-            data = self.stretches[int(owner)].data
-            time, inputs = data["sent"]
-            at_ends = data["start"] + grid[::2] - late
-            ends, integral = lagged(time, p.thrust(inputs), at_ends, lag)
-            mean = np.diff(integral, axis=0) / p.step
-            lane = which == number
-            thrust[::2, lane] = ends[:, None]
-            thrust[1::2, lane] = (1.5 * mean - 0.25 * (ends[:-1] + ends[1:]))[:, None]
-        curve = self.size_of(lanes, "thrust_curve")[:, None]
-        hover = p.total_mass * p.gravity / self.motors  # of one input channel [N]
-        since = self.of_windows(lanes, "since") + grid
-        faded = 1.0 + self.size_of(lanes, "thrust_fade") * since
-        curved = 1.0 + curve * (thrust / hover - 1.0)
-        return thrust * self._scale(lanes) * curved * faded[..., None]
-
     def simulate(self, lanes: Lanes) -> ndarray:
-        """See the base class.
-
-        The state: position and velocity of the vehicle, with a cable its vector to the payload and
-        that one's rate, with torques the body rates."""
-        rot = self._rotations(lanes)
-        mount = self._mount(rot)
-        slope, _ = self._dynamics(lanes, self._thrusts(lanes), rot, mount)
-        return integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
-
-    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
-        """See the base class."""
-        rot = self._rotations(lanes)
-        _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
-        moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
-        names = moments[0].keys() - {"slope"}  # which follows from the thrusts at the knots
-        weights = triangles(np.linspace(0.0, self.steps, self.knot_count), np.arange(len(moments)))
-        values = {}
-        for name in names:
-            values[name] = np.tensordot(weights, [moment[name] for moment in moments], 1)
-        knots = []
-        for i, stretch in enumerate(self.stretches):
-            at_knots = {name: value[:, i] for name, value in values.items()}
-            knots.append(at_knots | {"time": np.unique(stretch.latent_time)})
-        return knots
-
-    def _scale(self, lanes: Lanes) -> ndarray:
-        """Thrust over what the map says, shape (B, motors)."""
-        p = self.params
-        volts = np.zeros(len(lanes.owner))
-        if self.has_voltage:
-            volts = self.of_windows(lanes, "volts") - p.reference_voltage
-        sag = p.voltage_coefficient + self.size_of(lanes, "battery_sag")
-        scale = (1.0 + self.size_of(lanes, "thrust_gain")) * (1.0 + sag * volts)
-        scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
-        return scale[:, None] * (1.0 + scales[:, : self.motors])
+        """See the base class; what is seen of each lane, as a replay has it."""
+        return self._fly(lanes).seen.swapaxes(0, 1)
 
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
-        measured = []
-        for channel, name in enumerate(self.channels):
-            time = stretch.time[stretch.channel == channel]
-            values = self._sampled(name, time, stretch, path, lanes)
-            measured.append(values.reshape(len(path), -1))
-        return np.concatenate(measured, axis=1)
+        poses = 2 * np.count_nonzero(stretch.channel == 0) // 3
+        rest = np.count_nonzero(stretch.channel) // 3
+        seen = np.concatenate([path[:, :poses:2], path[:, poses : poses + rest]], axis=1)
+        return seen.reshape(len(path), -1)
 
-    def _sampled(
-        self, name: str, time: ndarray, stretch: Stretch, path: ndarray, lanes: Lanes
-    ) -> ndarray:
-        """Return what lanes of a stretch show of a channel, shape (L, n, C); ``time``: of all
-        components of its samples, shape (n C,).
-        """
-        start = stretch.data["start"]
-        step = self.params.step
-        grid = start + step * np.arange(path.shape[1])
-        if name in self.columns:
-            states = path[..., self.columns[name]]
-            time = time[:: states.shape[2]]
-            return np.array([on_grid(grid, lane, time) for lane in states])
-        time = time[::3]
-        value = path[..., 0:3]
-        rate = path[..., 3:6]
-        if name == "payload_pos_w":
-            value = value + path[..., 6:9]
-            rate = rate + path[..., 9:12]
-            return _late(time, self.size_of(lanes, "payload_delay"), grid, value, rate)
-        pos = _late(time, self.size_of(lanes, "pose_delay"), grid, value, rate)
-        lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
-        half = ((time - start) / (0.5 * step)).round().astype(int)
-        rot = stretch.data["rot"][np.clip(half, 0, 2 * self.steps) + self._spare]
-        return pos + np.einsum("nij,bj->bni", rot, lever)
+    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
+        """See the base class."""
+        flown = self._fly(lanes, keep=True).knots
+        cable = self.params.cable
+        listed = []
+        for i, stretch in enumerate(self.stretches):
+            rows = slice(i * self.knot_count, (i + 1) * self.knot_count)
+            values = {name: value[rows] for name, value in flown.items()}
+            values["time"] = np.unique(stretch.latent_time)
+            if NEIGHBOUR in self.inputs:
+                at_knots = np.linspace(0, self.rows, self.knot_count).round().astype(int)
+                values[NEIGHBOUR] = stretch.data[NEIGHBOUR][at_knots]
+            if cable is None:
+                for name in ("payload_pos_w", "payload_vel_w", "tension"):
+                    del values[name]
+            else:
+                values["mount_b"] = np.tile(cable.mount, (self.knot_count, 1))
+                mount_w = values["pos_w"] + rotate(values["quat_wb"], values["mount_b"])
+                reach = values["payload_pos_w"] - mount_w
+                values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+            listed.append(values)
+        return listed
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """See the base class; commands that an autopilot logs of its own motors all came."""
@@ -240,226 +119,191 @@ class FlyerModel(NumericModel):
         seen = self.measure(stretch, model.simulate(lanes), lanes)
         return (seen[1:] - seen[:1]).T
 
-    def _mount(self, rot: ndarray) -> Sequence[ndarray]:
-        """Return where the cable is attached, from the centre of mass, the velocity and the
-        acceleration of that point at the half steps, world frame, each of shape (half steps, B, 3).
+    def _fly(self, lanes: Lanes, keep: bool = False) -> Any:
+        """Replay lanes (``sim.kernels.replay.lanes.Replayed``).
+
+        ``keep``: whether the quantities at the knots of each are wanted."""
+        from sim.kernels.replay.lanes import Recording
+
+        driven, thrust = self._alike(lanes, OF_THRUST)
+        turned, attitude = self._alike(lanes, OF_ATTITUDE)
+        commands = self._commands(driven)
+        attitudes = self._attitudes(turned)
+        pairs = np.column_stack([thrust, attitude])
+        _, first, window = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+        windows = self._windows(lanes.owner[first], thrust[first], attitude[first])
+        tables = {}
+        for name, table in (commands | attitudes).items():
+            tables[name] = table.reshape(-1, *table.shape[2:])
+        theta, plant = np.unique(lanes.theta, axis=0, return_inverse=True)
+        sizes = dict(zip(self.numbers, theta.T))
+        replay = replay_of(self.params, self.laws, sizes, len(theta))
+        motors = commands["command"][thrust, 0]
+        states = self._begin(
+            lanes, motors, attitudes["attitude"][attitude, 0], attitudes["rate_b"][attitude, 0]
+        )
+        flown = self._lanes_of(lanes) | {"window": window.ravel(), "plant": plant.ravel()}
+        count = len(lanes.owner)
+        if keep:
+            flown["keep"] = self.knot_count * np.arange(count)
+        spacing = self.params.window / (self.knot_count - 1)
+        recording = Recording(windows, tables | self._stamps())
+        return replay.run(states, recording, flown, spacing, self.knot_count * count)
+
+    def _alike(self, lanes: Lanes, names: Sequence[str]) -> tuple[Lanes, ndarray]:
+        """Return lanes that stand for all of their window with the same sizes of some effects, and
+        the number of that which stands for each lane, shape (B,).
         """
-        cable = self.params.cable
-        if cable is None:
-            return ()
-        arm = rot @ cable.mount
-        rate = np.gradient(arm, 0.5 * self.params.step, axis=0, edge_order=2)
-        return arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)
+        columns = np.column_stack([lanes.owner, self.stack(lanes, *names)])
+        _, first, number = np.unique(columns, axis=0, return_index=True, return_inverse=True)
+        return lanes.part(first), number.ravel()
 
-    def _begin(self, lanes: Lanes, mount: Sequence[ndarray]) -> ndarray:
-        """States from the unknowns at the window's start."""
-        unknown = lanes.nuisance
-        if self.params.cable is None:
-            return unknown
-        length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
-        down = self.of_windows(lanes, "direction")
-        level = ((0, 0), (0, 1))  # a third component of 0
-        direction = down + normal_part(np.pad(unknown[:, 6:8], level), down)
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        swing = normal_part(np.pad(unknown[:, 8:10], level), direction)
-        gap = length * direction + mount[0][0]
-        rate = length * swing + mount[1][0]
-        return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
-
-    def _dynamics(
-        self, lanes: Lanes, thrust: ndarray, rot: ndarray, mount: Sequence[ndarray]
-    ) -> tuple[Slope, Quantities]:
-        """Return what gives the derivative of states, and what gives the quantities of laws there,
-        by the half step.
-
-        ``thrust``: [N], shape (half steps, B, motors); ``rot``: attitudes at the half steps."""
-        p = self.params
-        mass = (p.mass + self.size_of(lanes, "mass_quad"))[:, None]
-        tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
-        gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
-        wind = self.stack(lanes, "wind_x", "wind_y", "")
-        pushes = self.pushes_at(lanes, halves(self.steps))
-        names = [LATENT_BLOCKS[block] for block, _ in self.pushes[::3]]
-        latent = dict(zip(names, np.split(pushes, len(names), axis=2)))
-        force_of = self._force(lanes, thrust, rot)
-        if p.cable is not None:
-            pulled = self._pulled(lanes, mass, gravity, wind, mount)
-        if p.torque is not None:
-            turning = self._turning(lanes, thrust)
-
-        def loads_at(half: int, state: ndarray) -> dict[str, ndarray]:
-            loads = {name: push[half] for name, push in latent.items()}
-            loads["vehicle force"] = loads["vehicle force"] + force_of(half, state[:, 3:6] - wind)
-            return loads
-
-        def hung_at(half: int, state: ndarray) -> tuple[ndarray, ndarray]:
-            return pulled(half, state, loads_at(half, state))[2:]
-
-        quantities = self._quantities(lanes, thrust.sum(2), hung_at)
-
-        def slope(half: int, state: ndarray) -> ndarray:
-            vel = state[:, 3:6]
-            loads = loads_at(half, state)
-            if self.laws:
-                for block, load in exerted(self.laws, quantities(half, state)).items():
-                    loads[block] = loads.get(block, 0.0) + load
-            if p.cable is not None:
-                acc, acc_payload, *_ = pulled(half, state, loads)
-                parts = [vel, acc, state[:, 9:12], acc_payload - acc]
-            else:
-                parts = [vel, loads["vehicle force"] / mass + gravity]
-            if p.torque is not None:
-                parts.append(turning(half, state[:, -3:], loads["vehicle torque"]))
-            return np.concatenate(parts, 1)
-
-        return slope, quantities
-
-    def _rise(self, total: ndarray) -> ndarray:
-        """Return the slope of whole thrusts [N], shape (half steps, B), as knots show it [N/s]."""
+    def _commands(self, lanes: Lanes) -> dict[str, ndarray]:
+        """Return what the motors do in each row of lanes' flights, shape (B, rows, ...)."""
+        thrusts = self.thrusts(lanes, self.rows)
+        ends = thrusts[::2]
+        means = (ends[:-1] + 4.0 * thrusts[1::2] + ends[1:]) / 6.0
+        each = np.broadcast_to(means, (*means.shape[:2], 4)) * (means.shape[2] / 4.0)
+        # the whole thrust's slope between knots, as they show it
         knots = np.linspace(0.0, self.params.window, self.knot_count)
-        grid = self.params.window * halves(self.steps)
-        at_knots = triangles(knots, grid[::2]) @ total[::2]
-        slope = np.gradient(at_knots, knots, axis=0)
-        return triangles(grid, knots) @ slope
+        rows = self.row * np.arange(self.rows)
+        at_knots = triangles(knots, self.row * np.arange(self.rows + 1)) @ ends.sum(2)
+        slope = triangles(rows, knots) @ np.gradient(at_knots, knots, axis=0)
+        time = self.of_windows(lanes, "start")[:, None] + rows
+        return {"command_time": time, "command": each.swapaxes(0, 1), "thrust_rate": slope.T}
 
-    def _quantities(self, lanes: Lanes, total: ndarray, hung_at: Callable) -> Quantities:
-        """Return what gives the quantities of laws by the half step and states.
-
-        ``total``: thrust [N], shape (half steps, B); ``hung_at``: gives direction and pull [N] of
-        the cable by the half step and states."""
-        cable = self.params.cable
-        tables = {"rate_b": "rate", "quat_wb": "quat"}
-        if NEIGHBOUR in self.inputs:
-            tables[NEIGHBOUR] = NEIGHBOUR
-        measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
-        rise = self._rise(total)
-
-        def quantities(half: int, state: ndarray) -> dict[str, ndarray]:
-            values = {name: table[:, half + self._spare] for name, table in measured.items()}
-            values["time"] = np.zeros(len(state))
-            values["thrust"] = total[half]
-            values["slope"] = rise[half]
-            values["pos_w"] = state[:, :3]
-            values["vel_w"] = state[:, 3:6]
-            if cable is not None:
-                direction, pull = hung_at(half, state)
-                values["payload_pos_w"] = state[:, :3] + state[:, 6:9]
-                values["payload_vel_w"] = state[:, 3:6] + state[:, 9:12]
-                values["cable_dir_w"] = direction
-                values["tension"] = pull[:, 0]
-                values["mount_b"] = np.tile(cable.mount, (len(state), 1))
-            return values
-
-        return quantities
-
-    def _rotations(self, lanes: Lanes) -> ndarray:
-        """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
-        late = self._spare + self.size_of(lanes, "attitude_delay") / (0.5 * self.params.step)
-        position = np.arange(2 * self.steps + 1)[:, None] + late
-        measured = self.of_windows(lanes, "rot")
-        index = np.clip(position.astype(int), 0, measured.shape[1] - 2)
-        lane = np.arange(len(lanes.owner))
+    def _attitudes(self, lanes: Lanes) -> dict[str, ndarray]:
+        """Return the attitudes that lanes take, and how they turn, in each row of their flights,
+        shape (B, rows, ...): measured ones without what is wrong with them.
+        """
+        first = spare(self.row)
+        late = first + self.size_of(lanes, "attitude_delay") / self.row
+        measured = self.of_windows(lanes, "turned")
+        position = late[:, None] + np.arange(self.rows + 1)
+        index = position.astype(int).clip(0, measured.shape[1] - 2)
+        lane = np.arange(len(late))[:, None]
         before = measured[lane, index]
-        share = (position - index)[..., None, None]
-        return before + share * (measured[lane, index + 1] - before)
+        share = (position - index)[..., None]
+        quat, rate, lean = np.split(
+            before + share * (measured[lane, index + 1] - before), [4, 7], axis=2
+        )
+        quat /= np.linalg.norm(quat, axis=2, keepdims=True)
+        turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")[:, None]
+        turn = turn + self.size_of(lanes, "estimator_lean")[:, None, None] * lean
+        quat = _product(self._level(lanes)[:, None], _product(quat, quat_of_vector(turn)))
+        turned = vectors_between(quat[:, :-1].reshape(-1, 4), quat[:, 1:].reshape(-1, 4))
+        acc = np.diff(rate, axis=1) / self.row
+        if self.params.torque is not None:  # which turns the vehicle
+            acc = 0.0 * acc
+        neighbour = np.zeros_like(acc)
+        if NEIGHBOUR in self.inputs:
+            neighbour = self.of_windows(lanes, NEIGHBOUR)[:, : self.rows]
+        return {
+            "attitude": quat[:, :-1],
+            "rate_b": rate[:, :-1],
+            "turn_b": turned.reshape(acc.shape) / self.row,
+            "turn_acc_b": acc,
+            "neighbour_pos_w": neighbour,
+        }
 
-    def _force(self, lanes: Lanes, thrust: ndarray, rot: ndarray) -> Slope:
-        """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
+    def _level(self, lanes: Lanes) -> ndarray:
+        """Return the attitude of the measured frame in the world, shape (B, 4)."""
+        return quat_of_vector(self.stack(lanes, "frame_tilt_x", "frame_tilt_y", ""))
+
+    def _windows(self, owner: ndarray, thrust: ndarray, attitude: ndarray) -> dict[str, ndarray]:
+        """Return the windows of a replay.
+
+        ``owner``: of each the stretch; ``thrust, attitude``: numbers of what drives it."""
+        from sim.kernels.replay.kernel import ATTACHED, NO_PAYLOAD
+
+        start = np.array([s.data["start"] for s in self.stretches])[owner]
+        fields = {
+            "start": start,
+            "end": start + self.params.window,
+            "first_knot": start,
+            "knots": self.knot_count,
+            "payload": NO_PAYLOAD if self.params.cable is None else ATTACHED,
+            "latch": start + NEVER,
+            "clock_zero": start,
+            "command_first": self.rows * thrust,
+            "command_last": self.rows * (thrust + 1),
+            "attitude_first": self.rows * attitude,
+        }
+        for sensor, times in self._seen().items():
+            counts = np.array([len(time) for time in times])
+            fields[f"{sensor}_count"] = counts[owner]
+            fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[owner]
+        return {name: np.broadcast_to(value, len(owner)) for name, value in fields.items()}
+
+    def _seen(self) -> dict[str, list[ndarray]]:
+        """Return the stamps of the samples of each sensor in each stretch [s]."""
+        channels = {"vehicle": self.params.position, "payload": "payload_pos_w", "gyro": "rate_b"}
+        seen = {}
+        for sensor, name in channels.items():
+            number = self.channels.index(name) if name in self.channels else -1
+            seen[sensor] = [s.time[s.channel == number][::3] for s in self.stretches]
+        return seen
+
+    def _stamps(self) -> dict[str, ndarray]:
+        """Return the stamps of all stretches as a replay reads them."""
+        stamps = {f"{name}_time": np.concatenate(times) for name, times in self._seen().items()}
+        level = np.array([0.0, 0.0, 0.0, 1.0])  # seen attitudes are not looked at
+        return stamps | {"vehicle_quat": np.tile(level, (len(stamps["vehicle_time"]), 1))}
+
+    def _lanes_of(self, lanes: Lanes) -> dict[str, ndarray]:
+        """Return lanes of a replay, without their window and plant; one latent force acts in each
+        at most.
+        """
+        count = len(lanes.owner)
+        push = np.argmax(np.abs(lanes.latent), axis=1)
+        size = lanes.latent[np.arange(count), push]
+        block, axis = np.array(self.pushes)[push // self.knot_count].T
+        none = np.full(count, -1)
+        return {
+            "state": np.arange(count),
+            "axis": np.where(size == 0.0, -1, 3 * block + axis),
+            "knot": push % self.knot_count,
+            "size": size,
+            "substep": np.full(count, self.row / (1 if self.params.cable is None else SWINGING)),
+            "shared": np.zeros(count, dtype=int),
+        } | dict.fromkeys(("keep", "resume", "parent", "skip"), none)
+
+    def _begin(
+        self, lanes: Lanes, motors: ndarray, quat: ndarray, rate: ndarray
+    ) -> dict[str, ndarray]:
+        """Return initial states of a replay from the unknowns at the windows' start.
+
+        ``motors, quat, rate``: thrusts [N], attitudes and body rates there, shape (B, ...)."""
+        from sim.kernels.replay.kernel import STATE_FIELDS
+
         p = self.params
-        total = thrust.sum(2, keepdims=True)
-        added = self.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
-        drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
-        parasitic = self.size_of(lanes, "parasitic")[:, None]
-        lift = self.size_of(lanes, "translational_lift")[:, None]
-        turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")
-        lean = self.size_of(lanes, "estimator_lean")[:, None]
-        leaning = self.of_windows(lanes, "lean")
-        turns = np.any(turn) or np.any(lean)
-
-        def force(half: int, air: ndarray) -> ndarray:
-            vel_b = np.einsum("bji,bj->bi", rot[half], air)
-            level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
-            speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
-            force_b = -(drag + parasitic * speed) * vel_b
-            force_b[:, 2:3] += total[half] * (1.0 + lift * level)
-            if turns:
-                off = turn + lean * leaning[:, half + self._spare]
-                force_b = force_b + cross(off, force_b)
-            return np.einsum("bij,bj->bi", rot[half], force_b)
-
-        return force
-
-    def _pulled(
-        self,
-        lanes: Lanes,
-        mass: ndarray,
-        gravity: ndarray,
-        wind: ndarray,
-        mount: Sequence[ndarray],
-    ) -> Callable:
-        """Return what gives accelerations of vehicle and payload, the cable's direction, and what
-        it pulls with [N], by the half step, states and loads; it never pushes.
-        """
-        payload = (self.params.cable.mass + self.size_of(lanes, "mass_payload"))[:, None]
-        payload_drag = self.size_of(lanes, "payload_drag")[:, None]
-        reduced = 1.0 / (1.0 / payload + 1.0 / mass)
-
-        def pulled(half: int, state: ndarray, loads: Mapping) -> tuple[ndarray, ...]:
-            arm, rate, acc = (part[half] for part in mount)
-            gap = state[:, 6:9] - arm
-            gap_rate = state[:, 9:12] - rate
-            vel = state[:, 3:6] + state[:, 9:12] - wind
-            drag = -payload_drag * np.sqrt(_products(vel, vel)) * vel
-            free = loads["vehicle force"] / mass + gravity
-            free_payload = (drag + loads["payload force"]) / payload + gravity
-            length = np.sqrt(_products(gap, gap))
-            direction = gap / length
-            separation = _products(direction, free_payload - free - acc)
-            relative = separation + _products(gap_rate, gap_rate) / length
-            pull = np.maximum(relative * reduced, 0.0)
-            pull_w = pull * direction
-            return free + pull_w / mass, free_payload - pull_w / payload, direction, pull
-
-        return pulled
-
-    def _turning(self, lanes: Lanes, thrust: ndarray) -> Callable:
-        """Return what gives the angular acceleration from the motors' thrusts and the offset of the
-        centre of mass, by the half step, rates and a torque [N m].
-        """
-        p = self.params.torque
-        scale = 1.0 + self.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
-        inertia = p.inertia * scale
-        com_x, com_y = self.stack(lanes, "com_x", "com_y").T
-        total = thrust.sum(2)
-        lever = np.stack([-com_y * total, com_x * total, 0.0 * total], -1)
-        torque = p.of(thrust) + lever
-
-        def turning(half: int, rate: ndarray, push: ndarray) -> ndarray:
-            return (torque[half] - cross(rate, inertia * rate) + push) / inertia
-
-        return turning
+        unknown = lanes.nuisance
+        count = len(unknown)
+        shapes = {"real": (), "vec4": (4,), "real[]": (1,), "vec3[]": (1, 3)}
+        state = {
+            name: np.zeros((count, *shapes.get(kind, (3,)))) for name, kind in STATE_FIELDS.items()
+        }
+        level = self._level(lanes)
+        state["pos_w"] = rotate(level, unknown[:, :3])
+        state["vel_w"] = rotate(level, unknown[:, 3:6])
+        state["quat_wb"] = quat
+        state["rate_b"] = rate if p.torque is None else unknown[:, -3:]
+        state["motor_speed"] = motors
+        state["voltage"][:] = p.reference_voltage
+        if p.cable is not None:
+            down = self.of_windows(lanes, "direction")
+            flat = ((0, 0), (0, 1))  # a third component of 0
+            direction = down + normal_part(np.pad(unknown[:, 6:8], flat), down)
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            swing = normal_part(np.pad(unknown[:, 8:10], flat), direction)
+            state["cable_dir_w"][:, 0] = rotate(level, direction)
+            state["cable_vel_w"][:, 0] = rotate(level, swing)
+            mass = p.cable.mass + self.size_of(lanes, "mass_payload")
+            length = p.cable.length + self.size_of(lanes, "rope_length")
+            state["stiffness"][:, 0] = mass * p.gravity * length
+        return state
 
 
-def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
-    """Return the names that all logs hold."""
-    return [name for name in names if all(name in log for log in logs)]
-
-
-def _late(time: ndarray, delays: ndarray, grid: ndarray, value: ndarray, rate: ndarray) -> ndarray:
-    """Return what stamps show of lanes that are late, shape (L, N, 3).
-
-    ``time``: shape (N,); ``delays``: of the lanes [s], shape (L,); ``value, rate``: of the lanes on
-    a grid and its derivative, shape (L, T, 3)."""
-    out = np.empty((len(value), len(time), 3))
-    for delay in np.unique(delays):
-        members = delays == delay
-        path = CubicHermiteSpline(grid, value[members], rate[members], axis=1)
-        out[members] = path(time - delay)
-    return out
-
-
-def _products(a: ndarray, b: ndarray) -> ndarray:
-    """Inner products of rows, shape (B, 1); of a few rows, ``np.sum`` and ``np.linalg.norm`` take
-    several times as long.
-    """
-    return np.einsum("bi,bi->b", a, b)[:, None]
+def _product(a: ndarray, b: ndarray) -> ndarray:
+    """Return products of quaternions, shape (..., 4)."""
+    return np.stack(multiply(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)), -1)

@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import cross, matrix_of_quat, normal_part
+from visthrow.common.rotations import cross, normal_part, rotate
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -21,6 +21,7 @@ LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
 Table = tuple[ndarray, ndarray, ndarray]
 """Stamps [s], shape (n,), values, shape (n, C), and their noise, shape (C,)."""
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
+ROWS = 2  # of commands and attitudes a step
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
 # median thrust over the weight, by the map: a map may be far off, a unit is off by more
@@ -83,29 +84,23 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
     driving = [params.position, params.attitude, params.input]
     if NEIGHBOUR in log:
         driving.append(NEIGHBOUR)
-    margin = spare(params.step)
-    steps = round(params.window / params.step)
-    halves = np.arange(-margin, 2 * steps + 1 + margin)
+    row = params.step / ROWS
+    margin = spare(row)
+    rows = np.arange(-margin, round(params.window / row) + 1 + margin)
     stretches = []
     for start, tables, common in cut_flying(log, params, model.channels, driving):
         stamps, positions, _ = tables[0]
         if len(stamps) < 5 or np.min(positions[:, 2]) < params.lowest:
             continue
-        times = start + 0.5 * params.step * halves
+        times = start + row * rows
         quat = attitude_at(*log[params.attitude].samples(), times)
-        rot = matrix_of_quat(quat)
-        rates = rates_of(times, quat, params.step).values
+        rate = on_grid(*rates_of(times, quat, params.step), times)
+        lean = _lean(log, params.attitude, params.estimator_rate, times)
         by_name = dict(zip(model.channels, tables))
-        guess, spread, direction = _guess(by_name, params, rot[margin : margin + 2])
-        data = common | {
-            "rot": rot,
-            "quat": quat,
-            "rate": np.pad(rates, ((1, 1), (0, 0)), mode="edge"),
-            "direction": direction,
-            "lean": _lean(log, params.attitude, params.estimator_rate, times),
-        }
+        guess, spread, direction = _guess(by_name, params, quat[margin], rate[margin])
+        data = common | {"turned": np.hstack((quat, rate, lean)), "direction": direction}
         if NEIGHBOUR in log:
-            data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
+            data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times[margin:])
         span = start, start + params.window
         stretches.append(model.lay_out(number, "flight", tables, span, data, guess, spread))
     return stretches
@@ -125,9 +120,9 @@ def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
     return np.min(thrust) >= _IDLE * params.mass * params.gravity
 
 
-def spare(step: float) -> int:
-    """Half steps of attitudes before a window and behind it, for what may be late."""
-    return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
+def spare(row: float) -> int:
+    """Rows of attitudes, so far apart [s], before a window and behind it, for what may be late."""
+    return int(np.ceil(MOST_LATE / row)) + 1
 
 
 def cut_commands(commands: Samples, first: float, last: float) -> Samples:
@@ -177,7 +172,7 @@ def without_each(commands: Samples, params: FlyerParams, start: float) -> list[S
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
-    """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where
+    """Turn from a leaning estimate of the attitude to the true one, shape (T, 3); 0 where
     nothing tells it.
 
     In flight the accelerometer tells thrust alone; a filter that knows it as thrust alone takes
@@ -218,12 +213,11 @@ def _line(table: Table, start: float) -> ndarray:
 
 
 def _guess(
-    tables: Mapping[str, Table], params: FlyerParams, rot: ndarray
+    tables: Mapping[str, Table], params: FlyerParams, quat: ndarray, rate: ndarray
 ) -> tuple[ndarray, ndarray, ndarray]:
     """Unknowns at the start, their spread, and the cable's direction there.
 
-    ``tables``: samples of each channel; ``rot``: attitudes at the start and half a step later,
-    shape (2, 3, 3).
+    ``tables``: samples of each channel; ``quat, rate``: attitude and body rate at the start.
     """
     measured = tables[params.position]
     start = float(measured[0][0])
@@ -236,15 +230,15 @@ def _guess(
         table = tables["payload_pos_w"]
         if len(table[0]) >= 4:
             pos_p, vel_p = _line(table, start)
-            arm, next_arm = rot @ params.cable.mount
-            gap = pos_p - pos - arm
+            mount = np.array(params.cable.mount)
+            gap = pos_p - pos - rotate(quat, mount)
             direction = gap / np.linalg.norm(gap)
-            arm_rate = (next_arm - arm) / (0.5 * params.step)
+            arm_rate = rotate(quat, cross(rate, mount))
             swing = normal_part((vel_p - vel - arm_rate) / params.cable.length, direction)
         guess += [0.0, 0.0, *swing[:2]]
         spread += [0.1, 0.1, 1.0, 1.0]
     if params.torque is not None:
-        _, rate, _ = tables["rate_b"]
-        guess += list(rate[0]) if len(rate) else [0.0] * 3
+        _, gyro, _ = tables["rate_b"]
+        guess += list(gyro[0]) if len(gyro) else [0.0] * 3
         spread += [1.0] * 3
     return np.array(guess), np.array(spread), direction

@@ -4,28 +4,23 @@ accelerometer and gyro.
 Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
 of torque to inertia. An accelerometer's offset hides the map's scale."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy import ndarray
 
-from visthrow.diagnose.models.numeric import (
-    Lanes,
-    Stretch,
-    halves,
-    integrate,
-)
-from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, in_all
+from visthrow.common.rotations import cross
+from visthrow.diagnose.models.numeric import Lanes, Stretch, halves, integrate
+from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
-from visthrow.diagnose.models.quadrotor.flyer_windows import (
-    cut_flying,
-)
-from visthrow.logs.check.relations import Relation, derivative, relate
+from visthrow.diagnose.models.quadrotor.flyer_windows import cut_flying
+from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
 from visthrow.logs.flightlog import FlightLog, Samples
 
 CHANNELS = ("acc_b", "rate_b")
+COLUMNS = slice(3, 4), slice(0, 3)  # of the state that these channels show
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
 OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
 # correlation of angular acceleration with the commands' torques, from which inertia is told: 0.99
@@ -45,8 +40,8 @@ class ImuParams(QuadrotorParams):
     torque: TorqueParams  # how thrusts turn the vehicle
 
 
-class ImuModel(FlyerModel):
-    """Windows of flights of one vehicle; motors and torques are those of the base class."""
+class ImuModel(DrivenModel):
+    """Windows of flights of one vehicle."""
 
     table = "imu"
     anchored = True  # an accelerometer is off by little, which a wrong map is not
@@ -59,7 +54,6 @@ class ImuModel(FlyerModel):
         """
         self.needed = (params.input, *CHANNELS)
         self.inputs = (params.input, *in_all(logs, "battery_voltage"))
-        self.columns = {"acc_b": slice(3, 4), "rate_b": slice(0, 3)}
         turned = [r for log in logs if (r := _turned(log, params)) is not None]
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
             self.channels = CHANNELS[:1]
@@ -85,7 +79,7 @@ class ImuModel(FlyerModel):
         """See the base class; the state: body rates, and behind them the force along the rotors'
         axis over the mass [m/s^2], with the accelerometer's offset.
         """
-        thrust = self._thrusts(lanes)
+        thrust = self.thrusts(lanes, self.steps)
         pushes = self.pushes_at(lanes, halves(self.steps))
         turning = self._turning(lanes, thrust)
 
@@ -100,6 +94,33 @@ class ImuModel(FlyerModel):
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
         acc = push + lanes.nuisance[:, 3:]
         return np.concatenate([rates, acc[..., None]], 2)
+
+    def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
+        """See the base class."""
+        grid = stretch.data["start"] + self.params.step * np.arange(path.shape[1])
+        measured = []
+        for channel in range(len(self.channels)):
+            states = path[..., COLUMNS[channel]]
+            time = stretch.time[stretch.channel == channel][:: states.shape[2]]
+            measured.append(np.array([on_grid(grid, lane, time).ravel() for lane in states]))
+        return np.concatenate(measured, axis=1)
+
+    def _turning(self, lanes: Lanes, thrust: ndarray) -> Callable:
+        """Return what gives the angular acceleration from the motors' thrusts and the offset of the
+        centre of mass, by the half step, rates and a torque [N m].
+        """
+        p = self.params.torque
+        scale = 1.0 + self.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
+        inertia = p.inertia * scale
+        com_x, com_y = self.stack(lanes, "com_x", "com_y").T
+        total = thrust.sum(2)
+        lever = np.stack([-com_y * total, com_x * total, 0.0 * total], -1)
+        torque = p.of(thrust) + lever
+
+        def turning(half: int, rate: ndarray, push: ndarray) -> ndarray:
+            return (torque[half] - cross(rate, inertia * rate) + push) / inertia
+
+        return turning
 
 
 def _turned(log: FlightLog, params: ImuParams) -> Relation | None:

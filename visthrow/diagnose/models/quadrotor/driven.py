@@ -1,0 +1,121 @@
+"""What drives a quadrotor whose commands were logged: windows in which it flies, and the thrust of
+its motors there.
+"""
+
+from abc import abstractmethod
+from collections.abc import Container, Sequence
+
+import numpy as np
+from numpy import ndarray
+
+from visthrow.diagnose.models.catalogue import ModelEffect
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
+from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, QuadrotorParams
+from visthrow.diagnose.models.quadrotor.flyer_windows import NEIGHBOUR, expect_thrust, lagged
+from visthrow.logs.flightlog import FlightLog
+
+SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
+BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # number of the latent block that a channel shows
+
+
+class DrivenModel(NumericModel):
+    """Windows of flights of one vehicle."""
+
+    latent_step = 1e-2
+    knot_count = 8
+
+    def __init__(self, logs: Sequence[FlightLog], params: QuadrotorParams) -> None:
+        """Cut the flights into windows.
+
+        Raises LogError where no log has the channels, or none flies.
+        """
+        self.describe(logs, params)
+        blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
+        self.pushes = [(block, axis) for block in blocks for axis in range(3)]
+        super().__init__(logs, params)
+        self.steps = round(params.window / params.step)
+
+    @abstractmethod
+    def describe(self, logs: Sequence[FlightLog], params: QuadrotorParams) -> None:
+        """Set the channels that are looked at, that drive the model, and that it needs."""
+
+    @property
+    def motors(self) -> int:
+        """Return the number of columns of the inputs."""
+        return self.stretches[0].data["sent"].values.shape[1]
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether all logs tell the battery's voltage."""
+        return "battery_voltage" in self.inputs
+
+    def catalogue(self) -> list[ModelEffect]:
+        """See the base class; where the voltage is logged, thrust fades with it."""
+        effects = super().catalogue()
+        return [e for e in effects if not (self.has_voltage and e.name == "thrust_fade")]
+
+    def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
+        """See the base class; at most ``most_windows``, spread evenly.
+
+        Raises LogError: commands are of another size than carries the vehicle.
+        """
+        stretches = super().cut(logs)
+        limit = self.params.most_windows
+        for name in ("battery_voltage", NEIGHBOUR):
+            count = sum(name in log for log in logs)
+            if 0 < count < len(logs):
+                note = f"{name} is not used: only {count} of {len(logs)} logs hold it"
+                self.notes = (*self.notes, note)
+        if stretches:
+            expect_thrust(stretches, self.params)
+        if len(stretches) <= limit:
+            return stretches
+        self.notes = (*self.notes, f"long flights: {limit} windows are looked at, spread over all")
+        chosen = np.linspace(0, len(stretches) - 1, limit).round().astype(int)
+        return [stretches[i] for i in chosen]
+
+    def thrusts(self, lanes: Lanes, steps: int) -> ndarray:
+        """Thrust of each motor at the half steps of a window [N], shape (half steps, B, motors): of
+        held commands by the map, through a lag.
+
+        In the middle of a step stands what makes Simpson's rule, and so the integration, give the
+        step's own mean: commands switch there."""
+        p = self.params
+        step = p.window / steps
+        grid = 0.5 * step * np.arange(2 * steps + 1)[:, None]
+        delay = p.command_delay + self.size_of(lanes, "cmd_delay")
+        tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
+        columns = [lanes.owner, delay, np.maximum(tau, SHORTEST)]
+        distinct, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+        thrust = np.empty((len(grid), len(lanes.owner), self.motors))
+        for number, (owner, late, lag) in enumerate(distinct):
+            data = self.stretches[int(owner)].data
+            time, inputs = data["sent"]
+            at_ends = data["start"] + grid[::2] - late
+            ends, integral = lagged(time, p.thrust(inputs), at_ends, lag)
+            mean = np.diff(integral, axis=0) / step
+            lane = which == number
+            thrust[::2, lane] = ends[:, None]
+            thrust[1::2, lane] = (1.5 * mean - 0.25 * (ends[:-1] + ends[1:]))[:, None]
+        curve = self.size_of(lanes, "thrust_curve")[:, None]
+        hover = p.total_mass * p.gravity / self.motors  # of one input channel [N]
+        since = self.of_windows(lanes, "since") + grid
+        faded = 1.0 + self.size_of(lanes, "thrust_fade") * since
+        curved = 1.0 + curve * (thrust / hover - 1.0)
+        return thrust * self._scale(lanes) * curved * faded[..., None]
+
+    def _scale(self, lanes: Lanes) -> ndarray:
+        """Thrust over what the map says, shape (B, motors)."""
+        p = self.params
+        volts = np.zeros(len(lanes.owner))
+        if self.has_voltage:
+            volts = self.of_windows(lanes, "volts") - p.reference_voltage
+        sag = p.voltage_coefficient + self.size_of(lanes, "battery_sag")
+        scale = (1.0 + self.size_of(lanes, "thrust_gain")) * (1.0 + sag * volts)
+        scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
+        return scale[:, None] * (1.0 + scales[:, : self.motors])
+
+
+def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
+    """Return the names that all logs hold."""
+    return [name for name in names if all(name in log for log in logs)]

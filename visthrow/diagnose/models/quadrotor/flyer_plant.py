@@ -1,0 +1,129 @@
+"""The simulator's plant of a setup's quadrotor, with effects of any size."""
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy import ndarray
+
+from sim.effects.setting import AERODYNAMICS
+from sim.params import LawParams, PlantParams, RopeParams, SensingParams, changed
+from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
+from visthrow.task import load_experiment, plant_of
+
+ARM = 1e-3  # of rotors whose torques are not simulated [m]
+# radius of gyration of a vehicle that nothing turns but its measured attitude [m]
+UNTURNED = 100.0
+ALMOST_NONE = 1e-9  # of what may not be without any
+ENOUGH = 1e3  # weights that motors lift: no thrust is limited
+NO_CABLE = CableParams(1.0, 1.0)  # which no window flies
+
+
+@cache
+def _known_plant() -> PlantParams:
+    """Return a plant for the numbers that do nothing where thrusts and attitudes are given."""
+    return plant_of(load_experiment("state"))
+
+
+def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantParams:
+    """Return the plant of a setup as it stands, whose commands are the motors' thrusts at once."""
+    known = _known_plant()
+    torque = params.torque or TorqueParams(
+        (params.mass * UNTURNED**2,) * 3, ARM, ARM, ALMOST_NONE, (1.0, -1.0, -1.0, 1.0)
+    )
+    x, y = torque.arm_x, torque.arm_y
+    values: dict[str, Any] = {f"aero.{name}": 0.0 for name in AERODYNAMICS}
+    values |= {
+        "aero.kind": "rotor_drag",
+        "aero.drag_x": params.drag_xy,
+        "aero.drag_y": params.drag_xy,
+        "aero.drag_z": params.drag_z,
+        "battery.kind": "ideal",
+        "body.com": (0.0, 0.0, 0.0),
+        "body.inertia": torque.inertia,
+        "body.mass": params.mass,
+        "controller.max_thrust": ENOUGH * params.mass * params.gravity,
+        "controller.min_thrust": 0.0,
+        "motor.kind": "instant",
+        "queue.delay": 0.0,
+        "rotors.inertia": 0.0,
+        "rotors.radius": float(np.sqrt(max(torque.inertia) / params.mass)),
+        "rotors.spin": torque.spin,
+        "rotors.x": (x, x, -x, -x),
+        "rotors.y": (y, -y, y, -y),
+        "rotors.z": 0.0,
+        "thrust.gain": (1.0, 1.0, 1.0, 1.0),
+        "thrust.k_1": 1.0,
+        "thrust.k_f": ALMOST_NONE,
+        "thrust.torque_gain": 1.0,
+        "thrust.torque_ratio": max(torque.torque_ratio, ALMOST_NONE),
+        "thrust.voltage_coefficient": 0.0,
+    }
+    cable = params.cable or NO_CABLE
+    rope = RopeParams(
+        segments=1,
+        length=cable.length,
+        rope_mass=ALMOST_NONE * cable.mass,
+        payload_mass=cable.mass,
+        payload_inertia=0.0,
+        payload_offset=0.0,
+        payload_radius=0.0,
+        joint_damping=0.0,
+        mount=cable.mount,
+    )
+    vehicle = changed(known.vehicle, values)
+    return PlantParams(vehicle, rope, known.release, known.sim, laws=laws)
+
+
+@cache
+def _replay(params: FlyerParams, laws: tuple[LawParams, ...]) -> Any:
+    """Return the replay of a setup's vehicle (``sim.kernels.replay.lanes.Replay``)."""
+    from sim.kernels.replay.lanes import Replay
+
+    plants, sensings = [plant_for(params, laws)], [SensingParams()]
+    return Replay(plants, sensings, gravity=params.gravity, imposed=True)
+
+
+def replay_of(
+    params: FlyerParams, laws: tuple[LawParams, ...], sizes: Mapping[str, ndarray], count: int
+) -> Any:
+    """Return the replay of a setup's vehicle with effects of several sizes, a row of its plants
+    each.
+
+    ``sizes``: of effects that are not of thrust or attitude, shape (count,).
+    """
+    replay = _replay(params, laws)
+    rows = {name: np.repeat(row, count) for name, row in replay.rows.items()}
+
+    def size(name: str) -> ndarray | float:
+        return sizes.get(name, 0.0)
+
+    vehicle, rope, air, sensing = (rows[name] for name in ("vehicles", "ropes", "airs", "sensings"))
+    vehicle["body"]["mass"] += size("mass_quad")
+    vehicle["body"]["inertia"][:, :2] *= 1.0 + np.reshape(size("inertia_xy"), (-1, 1))
+    vehicle["body"]["inertia"][:, 2] *= 1.0 + size("inertia_z")
+    aero = vehicle["aero"]
+    aero["drag_x"] += size("rotor_drag_xy")
+    aero["drag_y"] += size("rotor_drag_xy")
+    aero["drag_z"] += size("rotor_drag_z")
+    aero["parasitic"] += size("parasitic")
+    aero["translational_lift"] += size("translational_lift")
+    for i, axis in enumerate("xyz"):
+        sensing["marker_offset"][:, i] += size(f"marker_{axis}")
+        sensing["frame_tilt"][:, i] -= size(f"frame_tilt_{axis}")
+        air["wind_w"][:, i] += size(f"wind_{axis}")
+        off = np.reshape(size(f"com_{axis}"), (-1, 1))
+        vehicle["body"]["com"][:, i : i + 1] += off
+        rope["mount"][:, i : i + 1] -= off
+    for axis in "xy":
+        vehicle["rotors"][axis] -= np.reshape(size(f"com_{axis}"), (-1, 1))
+    sensing["vehicle_delay"] += size("pose_delay")
+    sensing["payload_delay"] += size("payload_delay")
+    for name in ("segment_length", "last_center", "payload_arm"):
+        rope[name] += size("rope_length")
+    for name in ("payload_mass", "last_mass", "total_mass"):
+        rope[name] += size("mass_payload")
+    rope["last_inertia"] = rope["last_mass"] * rope["last_center"] ** 2
+    rope["payload_drag"] += size("payload_drag")
+    return replay.of_rows(rows)
