@@ -110,17 +110,14 @@ DATA_FIELDS = {
     "gyro_time": "real",
 }
 
-IMPOSED_WINDOW = {"attitude_first": "int"}  # row of its first command's attitude
-IMPOSED_DATA = {
-    # of a command, beside it
+IMPOSED_FIELDS = {
     "thrust_rate": "real",  # of all motors together [N/s]
-    # while a command acts: attitude when it begins to, and the rate at which that turns
-    "attitude": "quat",
-    "turn_b": "vec3",  # [rad/s]
+    "attitude": "quat",  # when the command begins to act
+    "turn_b": "vec3",  # rate at which that turns while it acts [rad/s]
     "turn_acc_b": "vec3",  # by which a vehicle is turned besides what torques do [rad/s^2]
     "neighbour_pos_w": "vec3",  # measured position of what may push the vehicle [m]
 }
-"""Further fields of a replay whose attitude is imposed."""
+"""Of each command, in a replay that imposes attitudes."""
 
 
 @dataclass(frozen=True)
@@ -294,10 +291,10 @@ def build_replay(
     vec3 = t.vec3
     L = segments
     State = st.array_struct(t, "ReplayState", STATE_FIELDS)
-    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS | (IMPOSED_WINDOW if imposed else {}))
+    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
     Lanes = st.array_struct(t, "Lanes", LANE_FIELDS)
     Knots = st.array_struct(t, "Knots", KNOT_FIELDS)
-    Data = st.array_struct(t, "Recorded", DATA_FIELDS | (IMPOSED_DATA if imposed else {}))
+    Data = st.array_struct(t, "Recorded", DATA_FIELDS | (IMPOSED_FIELDS if imposed else {}))
     Sensing = t.from_dataclass(SensingParams, {})
     Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
     flow, advance = build_flow(t, vehicle, EVERYTHING, motors=imposed)
@@ -415,9 +412,8 @@ def build_replay(
                 k.t1 = k.t0 + h
                 k.h = h
                 if wp.static(imposed):
-                    held = windows.attitude_first[w] + command - windows.command_first[w]
                     middle = k.t0 + real(0.5) * h - data.command_time[command]
-                    m.quad = faced(m.quad, data, held, middle, h)
+                    m.quad = faced(m.quad, data, command, middle, h)
                 k.quad = m.quad
                 k.pay = m.pay
                 k.pay_vel = m.pay_vel
@@ -428,9 +424,9 @@ def build_replay(
                     m.rope = chain.stretched(natural, m.rope, stiffness, u, h)
                 pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
                 if wp.static(imposed):
-                    twist = wp.cw_mul(p.body.inertia, data.turn_acc_b[held])
+                    twist = wp.cw_mul(p.body.inertia, data.turn_acc_b[command])
                     pushed.twist_b = pushed.twist_b + twist
-                    pushed.neighbour_pos_w = data.neighbour_pos_w[held]
+                    pushed.neighbour_pos_w = data.neighbour_pos_w[command]
                     pushed.thrust_rate = data.thrust_rate[command]
                 pushed = extra.on(p, m.rope, pushed, k.quad, n, u, stiffness, active, hanging)
                 if hanging != 0:

@@ -62,6 +62,23 @@ class Recording:
         return self._there[kernel, device]
 
 
+def still(count: int, segments: int) -> dict[str, ndarray]:
+    """Return states at rest under a rope of so many segments, fields of ``kernel.STATE_FIELDS``."""
+    shapes = {
+        "real": (),
+        "vec4": (4,),
+        "quat": (4,),
+        "real[]": (segments,),
+        "vec3[]": (segments, 3),
+    }
+    state = {}
+    for name, kind in rk.STATE_FIELDS.items():
+        state[name] = np.zeros((count, *shapes.get(kind, (3,))))
+    state["quat_wb"][:, 3] = 1.0
+    state["cable_dir_w"][..., 2] = -1.0
+    return state
+
+
 _BUILDS: dict = {}
 
 PIECES = 4  # of the lanes for each core of a CPU
@@ -85,7 +102,7 @@ class Replay:
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
         gravity: [m/s^2].
         imposed: whether the recording holds the attitudes that the vehicles take, fields of
-            ``kernel.IMPOSED_DATA``; commands then are the motors' thrusts, at once.
+            ``kernel.IMPOSED_FIELDS``; commands then are the motors' thrusts, at once.
     """
 
     def __init__(

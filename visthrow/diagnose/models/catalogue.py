@@ -26,6 +26,8 @@ class ModelEffect(Effect):
     # parameter of which theta takes no more than there is, in place of the lower bound
     lowest: str = ""
     needs: str = ""  # parameter that a setup may lack, and the effect with it
+    # numbers of the simulator that theta is added to, as "airs.wind_w.0", or with "-" taken from
+    changes: tuple[str, ...] = ()
 
     def for_params(self, params: Any) -> "ModelEffect":
         """Return the effect in the parameters' numbers."""

@@ -121,6 +121,15 @@ class Term:
         return f"{SYMBOLS[self.block]} = c {' '.join(factor.symbol for factor in self.parts)}"
 
 
+def add_cable(values: dict[str, ndarray], mount: Sequence[float]) -> None:
+    """Add to quantities at knots where a cable is attached [m, body frame, from the centre of mass]
+    and where it leads.
+    """
+    values["mount_b"] = np.tile(mount, (len(values["time"]), 1))
+    reach = KnotValues(values)["reach_w"]
+    values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+
+
 def term_of(law: LawParams) -> Term:
     """The term of a law that a file holds."""
     return Term(law.block, law.factors, law.vector)

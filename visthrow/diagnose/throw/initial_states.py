@@ -10,7 +10,8 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
-from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
+from sim.kernels.replay.kernel import ATTACHED, LOOSE
+from sim.kernels.replay.lanes import still
 from sim.params import GRAVITY, PlantParams, SensingParams, VehicleParams
 from visthrow.common.rotations import cross, normal_part
 from visthrow.diagnose.throw.cutting import Cut
@@ -302,20 +303,11 @@ def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
         open_volts = float(np.polynomial.polynomial.polyval(used, battery.ocv))
         square = open_volts**2 - 4.0 * battery.resistance * power
         volts = 0.5 * (open_volts + np.sqrt(max(square, 0.0)))
-    shapes = {
-        "real": (1,),
-        "vec4": (1, 4),
-        "quat": (1, 4),
-        "real[]": (1, L),
-        "vec3[]": (1, L, 3),
-    }
-    state = {name: np.zeros(shapes.get(kind, (1, 3))) for name, kind in STATE_FIELDS.items()}
-    state["quat_wb"][:, 3] = 1.0
+    state = still(1, L)
     state["motor_speed"][:] = np.sqrt(thrust / 4.0 / v.thrust.k_f)
     state["setpoint"][:] = flight.command[0, 1:]
     state["charge_used"][:] = used
     state["voltage"][:] = volts
-    state["cable_dir_w"][..., 2] = -1.0
     segments_below = np.arange(L, 0, -1) - 0.5
     mass_below = rope.payload_mass + rope.rope_mass * segments_below / L
     state["stiffness"][:] = mass_below * GRAVITY * rope.length / L

@@ -18,7 +18,7 @@ from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
-from visthrow.diagnose.models.law_terms import KnotValues
+from visthrow.diagnose.models.law_terms import add_cable
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
 from visthrow.diagnose.throw.recorded_flight import NEVER
@@ -253,10 +253,7 @@ def at_knots(
         for name in ("payload_pos_w", "payload_vel_w", "tension"):
             del values[name]
         return values
-    arm = np.subtract(setting.plant.rope.mount, setting.plant.vehicle.body.com)
-    values["mount_b"] = np.tile(arm, (len(time), 1))
-    reach = KnotValues(values)["reach_w"]
-    values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+    add_cable(values, np.subtract(setting.plant.rope.mount, setting.plant.vehicle.body.com))
     f = flights.flights[c.flight]
     if f.latch != NEVER:
         values["tension"][values["time"] > f.latch + setting.plant.release.lag] = 0.0

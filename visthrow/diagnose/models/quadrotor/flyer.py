@@ -14,9 +14,10 @@ import numpy as np
 from numpy import ndarray
 
 from visthrow.common.rotations import multiply, normal_part, quat_of_vector, rotate, vectors_between
+from visthrow.diagnose.models.law_terms import add_cable
 from visthrow.diagnose.models.numeric import Lanes, Stretch, triangles
 from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
-from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, FlyerParams
+from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
 from visthrow.diagnose.models.quadrotor.flyer_plant import replay_of
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
     NEIGHBOUR,
@@ -29,15 +30,6 @@ from visthrow.logs.flightlog import FlightLog
 
 SWINGING = 3  # steps a row where a payload swings below
 NEVER = 1e9  # after a start, when the cable is let go [s]
-# effects on the motors' thrust, and on the attitude that the vehicle takes
-OF_THRUST = (
-    *("cmd_delay", "motor_tau", "thrust_curve", "thrust_fade", "battery_sag", "thrust_gain"),
-    *(f"motor_{name}" for name in MOTORS),
-)
-OF_ATTITUDE = (
-    *("attitude_delay", "estimator_lean", "marker_rot_x", "marker_rot_y"),
-    *("frame_tilt_x", "frame_tilt_y"),
-)
 
 
 class FlyerModel(DrivenModel):
@@ -91,10 +83,7 @@ class FlyerModel(DrivenModel):
                 for name in ("payload_pos_w", "payload_vel_w", "tension"):
                     del values[name]
             else:
-                values["mount_b"] = np.tile(cable.mount, (self.knot_count, 1))
-                mount_w = values["pos_w"] + rotate(values["quat_wb"], values["mount_b"])
-                reach = values["payload_pos_w"] - mount_w
-                values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+                add_cable(values, cable.mount)
             listed.append(values)
         return listed
 
@@ -125,38 +114,41 @@ class FlyerModel(DrivenModel):
         ``keep``: whether the quantities at the knots of each are wanted."""
         from sim.kernels.replay.lanes import Recording
 
-        driven, thrust = self._alike(lanes, OF_THRUST)
-        turned, attitude = self._alike(lanes, OF_ATTITUDE)
-        commands = self._commands(driven)
-        attitudes = self._attitudes(turned)
-        pairs = np.column_stack([thrust, attitude])
+        pairs = np.column_stack([lanes.owner, lanes.theta])
         _, first, window = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
-        windows = self._windows(lanes.owner[first], thrust[first], attitude[first])
-        tables = {}
-        for name, table in (commands | attitudes).items():
-            tables[name] = table.reshape(-1, *table.shape[2:])
-        theta, plant = np.unique(lanes.theta, axis=0, return_inverse=True)
-        sizes = dict(zip(self.numbers, theta.T))
-        replay = replay_of(self.params, self.laws, sizes, len(theta))
-        motors = commands["command"][thrust, 0]
-        states = self._begin(
-            lanes, motors, attitudes["attitude"][attitude, 0], attitudes["rate_b"][attitude, 0]
-        )
-        flown = self._lanes_of(lanes) | {"window": window.ravel(), "plant": plant.ravel()}
+        flights = lanes.part(first)  # one for all that begin or are pushed otherwise
+        tables = self._commands(flights) | self._attitudes(flights)
+        begun = {name: table[window, 0] for name, table in tables.items()}
+        recorded = self._stamps()
+        for name, table in tables.items():
+            recorded[name] = table.reshape(-1, *table.shape[2:])
+        sizes, plant = np.unique(lanes.theta, axis=0, return_inverse=True)
+        replay = replay_of(self.params, self.laws, dict(zip(self.numbers, sizes.T)))
         count = len(lanes.owner)
-        if keep:
-            flown["keep"] = self.knot_count * np.arange(count)
-        spacing = self.params.window / (self.knot_count - 1)
-        recording = Recording(windows, tables | self._stamps())
-        return replay.run(states, recording, flown, spacing, self.knot_count * count)
-
-    def _alike(self, lanes: Lanes, names: Sequence[str]) -> tuple[Lanes, ndarray]:
-        """Return lanes that stand for all of their window with the same sizes of some effects, and
-        the number of that which stands for each lane, shape (B,).
-        """
-        columns = np.column_stack([lanes.owner, self.stack(lanes, *names)])
-        _, first, number = np.unique(columns, axis=0, return_index=True, return_inverse=True)
-        return lanes.part(first), number.ravel()
+        push = np.argmax(np.abs(lanes.latent), axis=1)  # one acts in a lane at most
+        size = lanes.latent[np.arange(count), push]
+        block, axis = np.array(self.pushes)[push // self.knot_count].T
+        none = np.full(count, -1)
+        swings = 1 if self.params.cable is None else SWINGING
+        flown = {
+            "window": window,
+            "plant": plant,
+            "state": np.arange(count),
+            "axis": np.where(size == 0.0, -1, 3 * block + axis),
+            "knot": push % self.knot_count,
+            "size": size,
+            "substep": np.full(count, self.row / swings),
+            "keep": self.knot_count * np.arange(count) if keep else none,
+            "shared": np.zeros(count, dtype=int),
+            **dict.fromkeys(("resume", "parent", "skip"), none),
+        }
+        return replay.run(
+            self._begin(lanes, begun),
+            Recording(self._windows(flights), recorded),
+            flown,
+            self.params.window / (self.knot_count - 1),
+            self.knot_count * count,
+        )
 
     def _commands(self, lanes: Lanes) -> dict[str, ndarray]:
         """Return what the motors do in each row of lanes' flights, shape (B, rows, ...)."""
@@ -210,13 +202,13 @@ class FlyerModel(DrivenModel):
         """Return the attitude of the measured frame in the world, shape (B, 4)."""
         return quat_of_vector(self.stack(lanes, "frame_tilt_x", "frame_tilt_y", ""))
 
-    def _windows(self, owner: ndarray, thrust: ndarray, attitude: ndarray) -> dict[str, ndarray]:
-        """Return the windows of a replay.
-
-        ``owner``: of each the stretch; ``thrust, attitude``: numbers of what drives it."""
+    def _windows(self, flights: Lanes) -> dict[str, ndarray]:
+        """Return the windows that a replay flies."""
         from sim.kernels.replay.kernel import ATTACHED, NO_PAYLOAD
 
-        start = np.array([s.data["start"] for s in self.stretches])[owner]
+        count = len(flights.owner)
+        start = self.of_windows(flights, "start")
+        first = self.rows * np.arange(count)
         fields = {
             "start": start,
             "end": start + self.params.window,
@@ -225,18 +217,17 @@ class FlyerModel(DrivenModel):
             "payload": NO_PAYLOAD if self.params.cable is None else ATTACHED,
             "latch": start + NEVER,
             "clock_zero": start,
-            "command_first": self.rows * thrust,
-            "command_last": self.rows * (thrust + 1),
-            "attitude_first": self.rows * attitude,
+            "command_first": first,
+            "command_last": first + self.rows,
         }
-        for sensor, times in self._seen().items():
-            counts = np.array([len(time) for time in times])
-            fields[f"{sensor}_count"] = counts[owner]
-            fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[owner]
-        return {name: np.broadcast_to(value, len(owner)) for name, value in fields.items()}
+        for sensor, stamps in self._seen().items():
+            counts = np.array([len(time) for time in stamps])
+            fields[f"{sensor}_count"] = counts[flights.owner]
+            fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[flights.owner]
+        return {name: np.broadcast_to(value, count) for name, value in fields.items()}
 
     def _seen(self) -> dict[str, list[ndarray]]:
-        """Return the stamps of the samples of each sensor in each stretch [s]."""
+        """Return the stamps of what each sensor shows of each stretch [s]."""
         channels = {"vehicle": self.params.position, "payload": "payload_pos_w", "gyro": "rate_b"}
         seen = {}
         for sensor, name in channels.items():
@@ -247,49 +238,24 @@ class FlyerModel(DrivenModel):
     def _stamps(self) -> dict[str, ndarray]:
         """Return the stamps of all stretches as a replay reads them."""
         stamps = {f"{name}_time": np.concatenate(times) for name, times in self._seen().items()}
-        level = np.array([0.0, 0.0, 0.0, 1.0])  # seen attitudes are not looked at
+        level = np.array([0.0, 0.0, 0.0, 1.0])  # attitudes seen are not looked at
         return stamps | {"vehicle_quat": np.tile(level, (len(stamps["vehicle_time"]), 1))}
 
-    def _lanes_of(self, lanes: Lanes) -> dict[str, ndarray]:
-        """Return lanes of a replay, without their window and plant; one latent force acts in each
-        at most.
-        """
-        count = len(lanes.owner)
-        push = np.argmax(np.abs(lanes.latent), axis=1)
-        size = lanes.latent[np.arange(count), push]
-        block, axis = np.array(self.pushes)[push // self.knot_count].T
-        none = np.full(count, -1)
-        return {
-            "state": np.arange(count),
-            "axis": np.where(size == 0.0, -1, 3 * block + axis),
-            "knot": push % self.knot_count,
-            "size": size,
-            "substep": np.full(count, self.row / (1 if self.params.cable is None else SWINGING)),
-            "shared": np.zeros(count, dtype=int),
-        } | dict.fromkeys(("keep", "resume", "parent", "skip"), none)
-
-    def _begin(
-        self, lanes: Lanes, motors: ndarray, quat: ndarray, rate: ndarray
-    ) -> dict[str, ndarray]:
+    def _begin(self, lanes: Lanes, begun: Mapping[str, ndarray]) -> dict[str, ndarray]:
         """Return initial states of a replay from the unknowns at the windows' start.
 
-        ``motors, quat, rate``: thrusts [N], attitudes and body rates there, shape (B, ...)."""
-        from sim.kernels.replay.kernel import STATE_FIELDS
+        ``begun``: what drives each lane there."""
+        from sim.kernels.replay.lanes import still
 
         p = self.params
         unknown = lanes.nuisance
-        count = len(unknown)
-        shapes = {"real": (), "vec4": (4,), "real[]": (1,), "vec3[]": (1, 3)}
-        state = {
-            name: np.zeros((count, *shapes.get(kind, (3,)))) for name, kind in STATE_FIELDS.items()
-        }
+        state = still(len(unknown), 1)
         level = self._level(lanes)
         state["pos_w"] = rotate(level, unknown[:, :3])
         state["vel_w"] = rotate(level, unknown[:, 3:6])
-        state["quat_wb"] = quat
-        state["rate_b"] = rate if p.torque is None else unknown[:, -3:]
-        state["motor_speed"] = motors
-        state["voltage"][:] = p.reference_voltage
+        state["quat_wb"] = begun["attitude"]
+        state["rate_b"] = begun["rate_b"] if p.torque is None else unknown[:, -3:]
+        state["motor_speed"] = begun["command"]
         if p.cable is not None:
             down = self.of_windows(lanes, "direction")
             flat = ((0, 0), (0, 1))  # a third component of 0

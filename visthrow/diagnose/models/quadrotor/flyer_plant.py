@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from sim.effects.setting import AERODYNAMICS
 from sim.params import LawParams, PlantParams, RopeParams, SensingParams, changed
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.task import load_experiment, plant_of
 
@@ -86,44 +87,33 @@ def _replay(params: FlyerParams, laws: tuple[LawParams, ...]) -> Any:
 
 
 def replay_of(
-    params: FlyerParams, laws: tuple[LawParams, ...], sizes: Mapping[str, ndarray], count: int
+    params: FlyerParams, laws: tuple[LawParams, ...], sizes: Mapping[str, ndarray]
 ) -> Any:
     """Return the replay of a setup's vehicle with effects of several sizes, a row of its plants
     each.
 
-    ``sizes``: of effects that are not of thrust or attitude, shape (count,).
+    ``sizes``: of all effects, shape (rows,).
     """
     replay = _replay(params, laws)
+    count = len(sizes["mass_quad"])
     rows = {name: np.repeat(row, count) for name, row in replay.rows.items()}
-
-    def size(name: str) -> ndarray | float:
-        return sizes.get(name, 0.0)
-
-    vehicle, rope, air, sensing = (rows[name] for name in ("vehicles", "ropes", "airs", "sensings"))
-    vehicle["body"]["mass"] += size("mass_quad")
-    vehicle["body"]["inertia"][:, :2] *= 1.0 + np.reshape(size("inertia_xy"), (-1, 1))
-    vehicle["body"]["inertia"][:, 2] *= 1.0 + size("inertia_z")
-    aero = vehicle["aero"]
-    aero["drag_x"] += size("rotor_drag_xy")
-    aero["drag_y"] += size("rotor_drag_xy")
-    aero["drag_z"] += size("rotor_drag_z")
-    aero["parasitic"] += size("parasitic")
-    aero["translational_lift"] += size("translational_lift")
-    for i, axis in enumerate("xyz"):
-        sensing["marker_offset"][:, i] += size(f"marker_{axis}")
-        sensing["frame_tilt"][:, i] -= size(f"frame_tilt_{axis}")
-        air["wind_w"][:, i] += size(f"wind_{axis}")
-        off = np.reshape(size(f"com_{axis}"), (-1, 1))
-        vehicle["body"]["com"][:, i : i + 1] += off
-        rope["mount"][:, i : i + 1] -= off
-    for axis in "xy":
-        vehicle["rotors"][axis] -= np.reshape(size(f"com_{axis}"), (-1, 1))
-    sensing["vehicle_delay"] += size("pose_delay")
-    sensing["payload_delay"] += size("payload_delay")
-    for name in ("segment_length", "last_center", "payload_arm"):
-        rope[name] += size("rope_length")
-    for name in ("payload_mass", "last_mass", "total_mass"):
-        rope[name] += size("mass_payload")
+    for effect in effects_of("flyer", params):
+        for change in effect.changes:
+            sign = -1.0 if change.startswith("-") else 1.0
+            _number(rows, change.strip("-")).T[:] += sign * sizes[effect.name]
+    if params.torque is not None:
+        inertia = rows["vehicles"]["body"]["inertia"]
+        inertia[:, :2] *= 1.0 + sizes["inertia_xy"][:, None]
+        inertia[:, 2] *= 1.0 + sizes["inertia_z"]
+    rope = rows["ropes"]
     rope["last_inertia"] = rope["last_mass"] * rope["last_center"] ** 2
-    rope["payload_drag"] += size("payload_drag")
     return replay.of_rows(rows)
+
+
+def _number(rows: Mapping[str, ndarray], path: str) -> ndarray:
+    """Return the number of a path in all rows of plants and sensors."""
+    group, *names = path.split(".")
+    number = rows[group]
+    for name in names:
+        number = number[:, int(name)] if name.isdigit() else number[name]
+    return number
