@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
+from sim.params import LawParams
 from tests.commands import run_command
 from tests.flightlogs import log_at, with_channels
 from tests.places import DATA
@@ -326,6 +327,42 @@ class TestFlyer:
         good = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(truth, right)]) ** 2))
         bad = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(nothing, right)]) ** 2))
         assert good < 0.1 * bad
+
+    @mark.parametrize(
+        ("name", "size", "expected"),
+        [
+            ("frame_tilt_x", 0.01, [0.0, -0.01 * G, 0.0]),
+            ("frame_tilt_y", 0.01, [0.01 * G, 0.0, 0.0]),
+            ("marker_rot_x", 0.01, [0.0, -0.01 * G, 0.0]),
+            ("marker_rot_y", 0.01, [0.01 * G, 0.0, 0.0]),
+            ("mass_quad", 0.003, [0.0, 0.0, -G / 11.0]),
+            ("thrust_gain", 0.02, [0.0, 0.0, 0.02 * G]),
+        ],
+    )
+    def test_effects_push_a_hovering_vehicle_as_their_equations_say(self, name, size, expected):
+        """Closed form: half the acceleration that an effect makes times the time squared."""
+        time = np.arange(0.0, 3.0, 0.01)
+        none = np.zeros(len(time))
+        log = log_at(
+            time,
+            pos_w=np.column_stack([none, none, none + 2.0]),
+            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
+        )
+        weight = Channel(time, none[:, None] + FLYER.mass * G, "N")
+        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0))
+        model = FlyerModel([with_channels(log, thrust_command=weight)], params)
+        seen = []
+        for theta in ({}, {name: size}):
+            lanes = model._lanes(model.size(theta))
+            (first, *_) = model.simulate(lanes)
+            seen.append(model.measure(model.stretches[0], first[None], lanes).reshape(-1, 3))
+        since = model.stretches[0].time[::3] - model.stretches[0].data["start"]
+        assert seen[1] - seen[0] == approx(0.5 * np.outer(since**2, expected), abs=3e-4)  # the angle squared
+
+    def test_more_laws_than_the_simulator_holds_are_refused(self):
+        law = LawParams("vehicle force", (), "vel", -1e-3)
+        with raises(LogError, match="5 laws; expected at most 4"):
+            FlyerModel([fly(3.0)], FLYER).with_laws([law] * 5).residuals({})
 
     def test_an_accelerometer_may_begin_after_a_window(self):
         log = fly(4.0)

@@ -218,7 +218,7 @@ def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
     return factors
 
 
-MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds: no simulator flies them
+MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds
 
 SCALARS = _factors(LAW_FACTORS["scalars"] | MEASURED["scalars"])
 """Scalars of a term."""

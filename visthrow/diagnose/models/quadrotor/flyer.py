@@ -114,8 +114,8 @@ class FlyerModel(DrivenModel):
         ``keep``: whether the quantities at the knots of each are wanted."""
         from sim.kernels.replay.lanes import Recording
 
-        pairs = np.column_stack([lanes.owner, lanes.theta])
-        _, first, window = np.unique(pairs, axis=0, return_index=True, return_inverse=True)
+        driven = np.column_stack([lanes.owner, lanes.theta])
+        _, first, window = np.unique(driven, axis=0, return_index=True, return_inverse=True)
         flights = lanes.part(first)  # one for all that begin or are pushed otherwise
         tables = self._commands(flights) | self._attitudes(flights)
         begun = {name: table[window, 0] for name, table in tables.items()}
@@ -192,7 +192,7 @@ class FlyerModel(DrivenModel):
             neighbour = self.of_windows(lanes, NEIGHBOUR)[:, : self.rows]
         return {
             "attitude": quat[:, :-1],
-            "rate_b": rate[:, :-1],
+            "rate_b": rate[:, :-1],  # where no torque is simulated
             "turn_b": turned.reshape(acc.shape) / self.row,
             "turn_acc_b": acc,
             "neighbour_pos_w": neighbour,

@@ -1,4 +1,6 @@
-"""The simulator's plant of a setup's quadrotor, with effects of any size."""
+"""The simulator's plant of a setup's quadrotor, with effects of any size.
+
+A cable is a massless rod on joints: it pulls, and would push."""
 
 from collections.abc import Mapping
 from functools import cache
@@ -9,6 +11,7 @@ from numpy import ndarray
 
 from sim.effects.setting import AERODYNAMICS
 from sim.params import LawParams, PlantParams, RopeParams, SensingParams, changed
+from visthrow.common.errors import LogError
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.task import load_experiment, plant_of
@@ -41,11 +44,9 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         "aero.drag_y": params.drag_xy,
         "aero.drag_z": params.drag_z,
         "battery.kind": "ideal",
-        "body.com": (0.0, 0.0, 0.0),
         "body.inertia": torque.inertia,
         "body.mass": params.mass,
         "controller.max_thrust": ENOUGH * params.mass * params.gravity,
-        "controller.min_thrust": 0.0,
         "motor.kind": "instant",
         "queue.delay": 0.0,
         "rotors.inertia": 0.0,
@@ -54,10 +55,8 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         "rotors.x": (x, x, -x, -x),
         "rotors.y": (y, -y, y, -y),
         "rotors.z": 0.0,
-        "thrust.gain": (1.0, 1.0, 1.0, 1.0),
         "thrust.k_1": 1.0,
         "thrust.k_f": ALMOST_NONE,
-        "thrust.torque_gain": 1.0,
         "thrust.torque_ratio": max(torque.torque_ratio, ALMOST_NONE),
         "thrust.voltage_coefficient": 0.0,
     }
@@ -73,17 +72,21 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         joint_damping=0.0,
         mount=cable.mount,
     )
-    vehicle = changed(known.vehicle, values)
-    return PlantParams(vehicle, rope, known.release, known.sim, laws=laws)
+    return PlantParams(changed(known.vehicle, values), rope, known.release, known.sim, laws=laws)
 
 
 @cache
 def _replay(params: FlyerParams, laws: tuple[LawParams, ...]) -> Any:
-    """Return the replay of a setup's vehicle (``sim.kernels.replay.lanes.Replay``)."""
+    """Return the replay of a setup's vehicle (``sim.kernels.replay.lanes.Replay``).
+
+    Raises LogError: the simulator flies no such vehicle or laws."""
     from sim.kernels.replay.lanes import Replay
 
-    plants, sensings = [plant_for(params, laws)], [SensingParams()]
-    return Replay(plants, sensings, gravity=params.gravity, imposed=True)
+    try:
+        plants, sensings = [plant_for(params, laws)], [SensingParams()]
+        return Replay(plants, sensings, gravity=params.gravity, imposed=True)
+    except ValueError as error:
+        raise LogError(f"the model cannot fly: {error}") from error
 
 
 def replay_of(
@@ -96,7 +99,7 @@ def replay_of(
     """
     replay = _replay(params, laws)
     count = len(sizes["mass_quad"])
-    rows = {name: np.repeat(row, count) for name, row in replay.rows.items()}
+    rows = {name: np.repeat(only, count) for name, only in replay.rows.items()}
     for effect in effects_of("flyer", params):
         for change in effect.changes:
             sign = -1.0 if change.startswith("-") else 1.0
