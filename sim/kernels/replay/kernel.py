@@ -182,15 +182,10 @@ def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
 
 
 @wp.func
-def faced(s: Any, data: Any, row: int, middle: Any, h: Any):
-    """The vehicle at the start of a step of h seconds, turned so that it has the imposed attitude
-    in its ``middle`` [s after the row's start].
-    """
-    out = s
-    half = type(h)(0.5) * h
-    q = data.attitude[row] * rotation_of_vector(s.quat_wb, middle * data.turn_b[row])
-    out.quat_wb = q * rotation_of_vector(s.quat_wb, -half * s.rate_b)
-    return out
+def imposed_attitude(like: Any, data: Any, command: int, time: Any):
+    """Attitude (of the type of ``like``) that is imposed while a command acts."""
+    since = time - data.command_time[command]
+    return data.attitude[command] * rotation_of_vector(like, since * data.turn_b[command])
 
 
 def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_quad, load_rope):
@@ -411,9 +406,10 @@ def build_replay(
                 k.t0 = m.time + real(float(j)) * h
                 k.t1 = k.t0 + h
                 k.h = h
-                if wp.static(imposed):
-                    middle = k.t0 + real(0.5) * h - data.command_time[command]
-                    m.quad = faced(m.quad, data, command, middle, h)
+                if wp.static(imposed):  # in the middle of the step it is that imposed
+                    half = real(0.5) * h
+                    q = imposed_attitude(m.quad.quat_wb, data, command, k.t0 + half)
+                    m.quad.quat_wb = q * rotation_of_vector(q, -half * m.quad.rate_b)
                 k.quad = m.quad
                 k.pay = m.pay
                 k.pay_vel = m.pay_vel
@@ -472,6 +468,9 @@ def build_replay(
                         pos1, vel1 = loose.payload(r, m.ball)
                         m.pay = pos1
                         m.pay_vel = vel1
+                if wp.static(imposed):
+                    k.quad.quat_wb = imposed_attitude(q, data, command, k.t0)
+                    m.quad.quat_wb = imposed_attitude(q, data, command, k.t1)
                 last = j == count - 1 and until >= end - tiny
                 # most steps show nothing, and to ask costs as much as a tenth of a step
                 if last or m.at.due <= k.t1:
