@@ -357,7 +357,9 @@ class TestFlyer:
             (first, *_) = model.simulate(lanes)
             seen.append(model.measure(model.stretches[0], first[None], lanes).reshape(-1, 3))
         since = model.stretches[0].time[::3] - model.stretches[0].data["start"]
-        assert seen[1] - seen[0] == approx(0.5 * np.outer(since**2, expected), abs=3e-4)  # the angle squared
+        assert seen[1] - seen[0] == approx(
+            0.5 * np.outer(since**2, expected), abs=3e-4
+        )  # the angle squared
 
     def test_more_laws_than_the_simulator_holds_are_refused(self):
         law = LawParams("vehicle force", (), "vel", -1e-3)
