@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 
 from bench import start
 from bench.report import Report, Table, finish
-from visthrow.logs.check.relations import REACH, derivative, relate
-from visthrow.logs.flightlog import Samples
+from visthrow.logs.check.relations import REACH, relate
+from visthrow.logs.samples import Samples
 
 KINDS = ("slow", "fast", "noisy", "crash")
 
@@ -52,7 +52,7 @@ def drawn(seed: int, kind: str, together: bool = False) -> tuple[np.ndarray, ...
 def measure(seed: int, kind: str, together: bool = False) -> tuple[float, float]:
     """Return the error of a delay and its stated deviation [s]."""
     time, pos, vel, late = drawn(seed, kind, together)
-    relation = relate(derivative(time, pos), Samples(time, vel))
+    relation = relate(Samples(time, pos).derivative(), Samples(time, vel))
     assert relation is not None
     return relation.delay - float(late), relation.delay_sd
 

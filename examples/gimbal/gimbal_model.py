@@ -139,7 +139,7 @@ def _tables(log: FlightLog, params: GimbalParams) -> dict[str, np.ndarray]:
     if len(vehicle.time) == len(payload.time):
         good = vehicle.valid & attitude.valid & payload.valid
     time = vehicle.time[good]
-    marker = on_grid(*payload.samples(), time) + [0.0, 0.0, params.marker_z]
+    marker = payload.samples().at(time) + [0.0, 0.0, params.marker_z]
     rot = matrix_of_quat(attitude.values[good])
     angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
     gimbal = Rotation.from_euler("XY", angles).as_matrix()

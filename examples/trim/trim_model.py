@@ -16,7 +16,6 @@ from visthrow.diagnose.models.numeric import (
     NumericModel,
     Stretch,
     command_of,
-    derivative,
     exerted,
 )
 from visthrow.logs.flightlog import FlightLog
@@ -97,7 +96,7 @@ class TrimModel(NumericModel):
         if params.velocity in log:
             channels.append(log[params.velocity].samples())
         else:
-            channels.append(derivative(*channels[1], 0.2))
+            channels.append(channels[1].derivative(0.2))
         if "battery_voltage" in log:
             channels.append(log["battery_voltage"].samples())
         stamps = log[params.command].time

@@ -7,13 +7,14 @@ and flights of a real vehicle, so that whatever reads one reads them all."""
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
 from visthrow.common.toml_text import tables_beside
+from visthrow.logs.samples import Samples
 
 FORMAT_VERSION = 1
 FRAMES = ("world", "body", "camera", "image", "mocap", "none")
@@ -38,13 +39,6 @@ def _standard_channels() -> dict[str, ChannelSpec]:
 
 STANDARD_CHANNELS = _standard_channels()
 """Channels of these names hold this, in this unit and frame; other names are free."""
-
-
-class Samples(NamedTuple):
-    """Samples of one quantity."""
-
-    time: np.ndarray  # [s], shape (N,)
-    values: np.ndarray  # shape (N, components)
 
 
 @dataclass(frozen=True)
@@ -179,6 +173,16 @@ class FlightLog:
 
     def __contains__(self, name: str) -> bool:
         return name in self.channels
+
+    def samples(self, name: str, fewest: int = 50) -> Samples | None:
+        """Return the valid samples of a channel; None where the log holds fewer."""
+        if name not in self or np.sum(self[name].valid) < fewest:
+            return None
+        return self[name].samples()
+
+    def notes(self, name: str) -> dict[str, Any]:
+        """Return the reader's notes on a channel."""
+        return self.meta.get("ingest", {}).get(name, {})
 
     def measured(self) -> "FlightLog":
         """Return the log without the channels that were worked out of others:

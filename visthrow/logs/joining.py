@@ -13,8 +13,8 @@ from scipy.signal import correlate, correlation_lags
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.logs.check import relations
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 
 RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
 # correlation of what was measured twice, below which two logs are not taken for one flight
@@ -88,20 +88,19 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
 def _turning(log: FlightLog) -> Samples | None:
     """Body rates over ``_SPAN``: by gyro, else by attitude."""
     if "rate_b" not in log:
-        return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
-    time, rate = log["rate_b"].samples()
-    if not len(time):
-        return None
-    overlap = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
+        return log["quat_wb"].samples().rates(_SPAN) if "quat_wb" in log else None
+    rates = log["rate_b"].samples()
+    time = rates.time
+    overlap = time[(time > time[:1] + 0.5 * _SPAN) & (time < time[-1:] - 0.5 * _SPAN)]
     if not len(overlap):
         return None
-    return Samples(overlap, relations.mean_over(time, rate, overlap, _SPAN))
+    return Samples(overlap, rates.mean_over(overlap, _SPAN))
 
 
 def _velocity(log: FlightLog) -> Samples | None:
     if "vel_w" in log:
         return log["vel_w"].samples()
-    return relations.derivative(*log["pos_w"].samples()) if "pos_w" in log else None
+    return log["pos_w"].samples().derivative() if "pos_w" in log else None
 
 
 def _force(log: FlightLog) -> Samples | None:
@@ -110,7 +109,7 @@ def _force(log: FlightLog) -> Samples | None:
         return _sized(*log["acc_b"].samples())
     if "pos_w" not in log:
         return None
-    time, acc = relations.derivative(*relations.derivative(*log["pos_w"].samples()))
+    time, acc = log["pos_w"].samples().derivative().derivative()
     return _sized(time, acc + [0.0, 0.0, GRAVITY])
 
 
@@ -156,7 +155,7 @@ def _on_common_grid(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, 
     """
     grid = np.arange(a[0][0], a[0][-1], 1.0 / _FINE_RATE)
     grid = grid[(grid > b[0][0] + offset) & (grid < b[0][-1] + offset)]
-    return relations.on_grid(*a, grid), relations.on_grid(*b, grid - offset)
+    return a.at(grid), b.at(grid - offset)
 
 
 def _alignment(x: np.ndarray, y: np.ndarray) -> float:

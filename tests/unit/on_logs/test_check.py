@@ -19,11 +19,12 @@ from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import QUESTIONS, excitation
-from visthrow.logs.check.relations import derivative, relate
+from visthrow.logs.check.relations import relate
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
-from visthrow.logs.flightlog import Channel, FlightLog, Samples
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.samples import Samples
 
 
 def faults(log: FlightLog, verdict: str = "bad") -> str:
@@ -345,7 +346,7 @@ def test_a_delay_that_noise_hides_is_not_told(width):
         pos = np.column_stack([width * np.sin(0.3 * time), 0 * time, 0 * time])
         vel = np.column_stack([0.3 * width * np.cos(0.3 * time), 0 * time, 0 * time])
         pos, vel = pos + rng.normal(0, 1e-3, pos.shape), vel + rng.normal(0, 5e-3, vel.shape)
-        found = relate(derivative(time, pos), Samples(time, vel))
+        found = relate(Samples(time, pos).derivative(), Samples(time, vel))
         assert abs(found.delay) < 2.0 * found.delay_sd
 
 

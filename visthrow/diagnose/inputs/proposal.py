@@ -15,7 +15,7 @@ from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, unit_by_name
 from visthrow.diagnose.inputs.recognition import Recognition, moves, rises
 from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, by_mass
-from visthrow.logs.check import physics, relations, thrust_checks
+from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap, TimeColumn
@@ -286,17 +286,17 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     if np.median(total) <= 0.0:
         return None
     mass = thrust_checks.mass_of(log)
-    time, pos = log["pos_w"].samples()
+    path = log["pos_w"].samples()
     length = 0.0
     if "payload_pos_w" in log:
-        time_p, pos_p = log["payload_pos_w"].samples()
-        gap = pos_p - relations.on_grid(time, pos, time_p)
+        payload = log["payload_pos_w"].samples()
+        gap = payload.values - path.at(payload.time)
         length = float(np.median(np.linalg.norm(gap, axis=1)))
     motors = 1 if name in ("thrust_command", "throttle") else 4
     hover = _usual(total) / motors
     share = 0.85 if length else 1.0  # of the vehicle in what flies, until both are weighed
     whole = weighed / share if weighed else mass or 1.0
-    payload = (1.0 - share) * whole
+    hanging = (1.0 - share) * whole
     if weighed is None:
         why = "stands for any, and the thrust is scaled to it"
         why = "is what its thrust carries" if mass else why
@@ -304,7 +304,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
             f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG"
         )
     if length:
-        proposal.questions.append(f"what does the payload weigh? {payload:.3g} kg is a guess")
+        proposal.questions.append(f"what does the payload weigh? {hanging:.3g} kg is a guess")
     newtons = mass is not None and name in ("command", "thrust_command")
     first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
@@ -316,10 +316,10 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         "mass": round(whole * share, 5),
         "thrust_map": [float(f"{x:.4g}") for x in power],
         "reference_voltage": float(np.round(np.median(volts), 2)),
-        "every": max(1, round(0.03 / float(np.median(np.diff(time))))),
+        "every": max(1, round(0.03 / float(np.median(np.diff(path.time))))),
         "drag_xy": float(f"{_DRAG * whole * share:.2g}"),
         **NAMES["flyer"],
     }
     if length:
-        flyer["cable"] = {"length": round(length, 4), "mass": round(payload, 5)}
+        flyer["cable"] = {"length": round(length, 4), "mass": round(hanging, 5)}
     return flyer

@@ -20,9 +20,10 @@ from visthrow.diagnose.inputs.unit_evidence import (
     turn_to,
 )
 from visthrow.logs.check import physics, relations
-from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, Samples
+from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
+from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 Y_UP = "x,-z,y"
@@ -392,7 +393,7 @@ class Recognition:
             if name not in self._made:
                 continue
             entry, channel = self._made[name]
-            slope = relations.derivative(*self._samples(self._group(name)), _SPAN)
+            slope = self._samples(self._group(name)).derivative(_SPAN)
             best = self._best(slope, [g for g in self._open(3) if g.unit not in LENGTHS])
             in_world = best[0].correlation if best else 0.0
             turned = name == "pos_w" and self._body_velocity(channel, in_world)
@@ -411,9 +412,9 @@ class Recognition:
         """
         if "quat_wb" not in self._made:
             return False
-        time, slope = relations.derivative(*path.samples(), _SPAN)
+        time, slope = path.samples().derivative(_SPAN)
         attitude = self._made["quat_wb"][1].samples()
-        turned = Samples(time, rotate_back(relations.attitude_at(*attitude, time), slope))
+        turned = Samples(time, rotate_back(attitude.attitudes(time), slope))
         best = self._best(turned, self._hinting("velocity"))
         if best is None:
             return False
@@ -430,7 +431,7 @@ class Recognition:
     def _rates(self) -> None:
         derived = Samples(np.empty(0), np.empty((0, 3)))
         if "quat_wb" in self._made:
-            derived = relations.rates_of(*self._made["quat_wb"][1].samples())
+            derived = self._made["quat_wb"][1].samples().rates()
         best = None
         for group in self._hinting("rate_b"):
             values = self._samples(group)
@@ -561,7 +562,7 @@ def _on_grid(samples: Samples, grid: np.ndarray) -> np.ndarray:
     """Return a group's values at times of a grid, zeros where too few are known."""
     if len(samples.time) < 100:
         return np.zeros((len(grid), 3))
-    return relations.on_grid(*samples, grid)
+    return samples.at(grid)
 
 
 def _size(samples: Samples) -> float:

@@ -12,10 +12,11 @@ import numpy as np
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.axes import OURS, turn_of
-from visthrow.logs.check import physics, relations
+from visthrow.logs.check import physics
 from visthrow.logs.check.thrust_checks import MASS_BAD
-from visthrow.logs.flightlog import Channel, Samples
+from visthrow.logs.flightlog import Channel
 from visthrow.logs.mapping import ChannelMap
+from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 LENGTHS = ("m", "mm", "cm")
@@ -142,13 +143,13 @@ def readings(
 
 def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> Lean:
     """Weigh a path against the lean that an attitude gives it."""
-    time_q, quat = attitude.channel.samples()
+    attitudes = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
-    stamps, acc = physics.accelerations(*rising(time, turned), "m", _SPAN)
-    if min(len(stamps), len(time_q)) < 50:
+    stamps, acc = physics.accelerations(rising(time, turned), "m", _SPAN)
+    if min(len(stamps), len(attitudes.time)) < 50:
         return NO_LEAN
-    up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
-    lean = relations.mean_over(stamps, GRAVITY * up[:, :2], stamps, _SPAN)
+    up = matrix_of_quat(attitudes.attitudes(stamps))[:, :, 2]
+    lean = Samples(stamps, GRAVITY * up[:, :2]).mean_over(stamps, _SPAN)
     lean = (lean - np.mean(lean, axis=0)).ravel()
     moved = (acc[:, :2] - np.mean(acc[:, :2], axis=0)).ravel()
     power = np.linalg.norm(lean) * np.linalg.norm(moved)
@@ -176,7 +177,7 @@ def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
     level; "" where none does.
     """
-    acc = physics.accelerations(*rising(time, path), "m")[1]
+    acc = physics.accelerations(rising(time, path), "m").values
     if not len(acc):
         return ""
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])

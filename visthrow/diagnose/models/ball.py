@@ -20,8 +20,8 @@ from visthrow.diagnose.models.numeric import (
     integrate,
     sigma_of,
 )
-from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 
 CHANNEL = "payload_pos_w"
 # of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a
@@ -122,10 +122,10 @@ def _free(time: ndarray, pos: ndarray, params: BallParams) -> list[tuple[float, 
     """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth
     of a second each way.
     """
-    stamps, vel = derivative(time, pos, 0.05)
-    if len(stamps) < 20:
+    vel = Samples(time, pos).derivative(0.05)
+    if len(vel.time) < 20:
         return []
-    stamps, acc = derivative(stamps, vel, 0.05)
+    stamps, acc = vel.derivative(0.05)
     off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
     falls = np.pad((off < FALLS * params.gravity).astype(int), 1)
     edges = np.flatnonzero(np.diff(falls))

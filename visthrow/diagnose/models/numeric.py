@@ -21,10 +21,9 @@ from visthrow.diagnose.models.law_terms import Term, carries, term_of
 from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.models.thrust_map import command_of as command_of
-from visthrow.logs.check.relations import derivative as derivative
-from visthrow.logs.check.relations import on_grid as on_grid
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.samples import on_grid as on_grid
 
 EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those

@@ -19,7 +19,8 @@ from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded_flight import measured
 from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust_checks
-from visthrow.logs.flightlog import Channel, FlightLog, Samples
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.samples import Samples
 
 # correlation of commanded and measured rates, with whichever axes, from which a log tells of its
 # commands
@@ -121,12 +122,13 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None
     where nothing flies.
     """
-    time, values = log["throttle"].samples()
-    share = values[:, 0]
+    throttle = log["throttle"].samples()
+    time = throttle.time
+    share = throttle.values[:, 0]
     flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else share > 0.0
     place = measured(log, "pos_w")
     if place is not None:
-        height = relations.on_grid(*place.samples(), time)[:, 2]
+        height = place.samples().at(time)[:, 2]
         flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
@@ -139,8 +141,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     acc = log["acc_b"].samples()
     first, last = acc.time[[0, -1]]
     grid = time[rows & (time > first + 0.2) & (time < last - 0.2)]
-    force = relations.mean_over(*acc, grid + LATE, 0.1)[:, 2] / GRAVITY
-    commanded = relations.mean_over(time, values, grid, 0.1)[:, 0] / hover
+    force = acc.mean_over(grid + LATE, 0.1)[:, 2] / GRAVITY
+    commanded = throttle.mean_over(grid, 0.1)[:, 0] / hover
     slope, level = np.polyfit(commanded, force, 1)
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
         return hover, 1.0, start, end
@@ -152,7 +154,7 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
         return None
-    rates = relations.rates_of(*attitude.samples())
+    rates = attitude.samples().rates()
     time, command = log["command"].samples()
     if len(rates.time) < 50 or len(time) < 20 or np.max(np.std(rates.values, axis=0)) < MOVES:
         return None

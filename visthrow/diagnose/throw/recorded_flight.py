@@ -10,9 +10,9 @@ from numpy import ndarray
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
-from visthrow.logs.check.relations import attitude_at
 from visthrow.logs.check.signals import sensor_sigma
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.samples import Samples
 
 NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
@@ -209,7 +209,7 @@ def _paired(
         close = quat.time[index] - quat.time[index - 1] < BETWEEN
         covered = (pos.time >= quat.time[0]) & (pos.time <= quat.time[last])
         rows = np.flatnonzero(close & covered)
-        attitudes = attitude_at(quat.time, quat.values, pos.time[rows])
+        attitudes = Samples(quat.time, quat.values).attitudes(pos.time[rows])
     if len(rows) < 5:
         raise DiagnoseError(
             f"flight {number}: positions and attitudes of the vehicle were never measured at one"

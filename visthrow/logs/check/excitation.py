@@ -8,11 +8,11 @@ import numpy as np
 
 from visthrow.common.rotations import tilt_deg
 from visthrow.common.toml_text import tables_beside
-from visthrow.logs.check import relations
 from visthrow.logs.check.physics import ATTITUDES
 from visthrow.logs.check.rows import Row
 from visthrow.logs.check.thrust_checks import IDLE_SHARE, IDLE_SPEED
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
 MOTORS = ("motor_command", "motor_speed", "pwm")
@@ -107,7 +107,7 @@ def _first(
     one.
     """
     for name in names:
-        samples = relations.samples_of(log, name, fewest)
+        samples = log.samples(name, fewest)
         if samples is not None:
             return name, samples
     return None, None
@@ -149,7 +149,7 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
     _, path = _first(log, POSITIONS, 51)
     if path is not None:
-        time, vel = relations.derivative(*path, 0.1)
+        time, vel = path.derivative(0.1)
         flies = (time >= flown[0]) & (time <= flown[1])
         speed = np.linalg.norm(vel[flies], axis=1)
         if len(speed):
@@ -160,7 +160,7 @@ def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
         x, y, z, w = attitude.values.T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
         figures["yaw_range_deg"] = np.degrees(_range(yaw, 2))
-    rate = relations.samples_of(log, "rate_b", 21)
+    rate = log.samples("rate_b", 21)
     if rate is not None:
         figures["rate_p95_rad_s"] = np.percentile(np.linalg.norm(rate.values, axis=1), 95)
 
@@ -179,21 +179,21 @@ def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
         thrust = thrust**2 if name == "motor_speed" else thrust
         if len(thrust):
             figures["thrust_range"] = _range(thrust, 5) / max(np.median(thrust), 1e-9)
-    voltage = relations.samples_of(log, "battery_voltage", 1)
+    voltage = log.samples("battery_voltage", 1)
     if voltage is not None:
         figures["voltage_range"] = _range(voltage.values[:, 0], 5)
 
 
 def _payload(log: FlightLog, figures: dict) -> None:
-    payload = relations.samples_of(log, "payload_pos_w")
+    payload = log.samples("payload_pos_w")
     if payload is None:
         return
-    vel = relations.derivative(*payload, 0.1).values
+    vel = payload.derivative(0.1).values
     if len(vel):
         figures["payload_speed_p95_m_s"] = np.percentile(np.linalg.norm(vel, axis=1), 95)
-    vehicle = relations.samples_of(log, "pos_w", 51)
+    vehicle = log.samples("pos_w", 51)
     if vehicle is not None:
-        rope = relations.on_grid(*vehicle, payload.time) - payload.values
+        rope = vehicle.at(payload.time) - payload.values
         figures["swing_deg"] = np.percentile(tilt_deg(rope), 95)
     if "release_command" in log:
         pressed = log["release_command"].values.astype(float).ravel() > 0.0

@@ -12,8 +12,8 @@ from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back, tilt_
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
-from visthrow.logs.check.signals import notes_of
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 
 # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
 # to be compared
@@ -74,9 +74,11 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
     yield from _same(log)
 
 
-def usable(samples: Samples, threshold: float) -> bool:
-    moves = len(samples.time) > 50 and np.max(np.std(samples.values, axis=0)) > threshold
-    return bool(moves)
+def usable(samples: Samples | None, threshold: float) -> bool:
+    """Tell whether there are enough samples, of something that moves by more than a threshold."""
+    if samples is None or len(samples.time) <= 50:
+        return False
+    return bool(np.max(np.std(samples.values, axis=0)) > threshold)
 
 
 def median_tilt(quat: np.ndarray) -> float:
@@ -87,7 +89,7 @@ def median_tilt(quat: np.ndarray) -> float:
 
 def _plausible(log: FlightLog) -> Iterator[Row]:
     for name, channel in log.channels.items():
-        path = relations.samples_of(log, name)
+        path = log.samples(name)
         placed = channel.unit == "m" and channel.values.shape[1:] == (3,)
         if placed and path is not None and "setpoint" not in name:
             yield from _plausible_path(name, path)
@@ -104,7 +106,7 @@ def _plausible_path(name: str, path: Samples) -> Iterator[Row]:
         )
         yield Row("units", name, "bad", text, {"period_s": period})
         return
-    speeds = np.linalg.norm(relations.derivative(*path, 0.1).values, axis=1)
+    speeds = np.linalg.norm(path.derivative(0.1).values, axis=1)
     if not len(speeds):
         return
     fast = np.percentile(speeds, 99)
@@ -121,7 +123,7 @@ def _plausible_path(name: str, path: Samples) -> Iterator[Row]:
 def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
     """Commands, voltages and angles of a size that only another unit gives them."""
     for name in ATTITUDES:
-        attitude = relations.samples_of(log, name)
+        attitude = log.samples(name)
         tilt = 0.0 if attitude is None else median_tilt(attitude.values)
         if tilt > STEEPEST:
             text = (
@@ -130,7 +132,7 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
             )
             yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
     for name in _SHARES:
-        share = relations.samples_of(log, name, 1)
+        share = log.samples(name, 1)
         if share is None or log[name].unit != "1":
             continue
         high = np.percentile(np.abs(share.values), 95)
@@ -138,7 +140,7 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
             text = f"95 % of the values reach {high:.3g}: no shares of the full command"
             yield Row("units", name, "bad", text, {"p95": high})
     for name in ("battery_voltage", "supply_voltage"):
-        voltage = relations.samples_of(log, name, 1)
+        voltage = log.samples(name, 1)
         middle = 0.0 if voltage is None else np.median(voltage.values)
         if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
             text = f"{middle:.3g} V: no such pack; another unit?"
@@ -150,16 +152,14 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
     velocity = log[vel].samples()
     if not (usable(place, 0.02) and usable(velocity, 0.0)):
         return
-    message = notes_of(log, pos).get("message")
-    one_clock = message is not None and message == notes_of(log, vel).get("message")
-    yield from _compared(relations.derivative(*place), velocity, f"d({pos})/dt, {vel}", one_clock)
+    message = log.notes(pos).get("message")
+    one_clock = message is not None and message == log.notes(vel).get("message")
+    yield from _compared(place.derivative(), velocity, f"d({pos})/dt, {vel}", one_clock)
 
 
 def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
-    measured = relations.samples_of(log, "rate_b")
-    if measured is None:
-        return
-    derived = relations.rates_of(*log[quat].samples())
+    measured = log.samples("rate_b")
+    derived = log[quat].samples().rates()
     turns = usable(derived, MOVES) or usable(measured, MOVES)
     if turns and usable(derived, 0.0) and usable(measured, 0.0):
         yield from _compared(derived, measured, f"rate of {quat}, rate_b")
@@ -270,15 +270,15 @@ def _disagrees(relation: relations.Relation) -> bool:
 
 def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
     """Check that the mean force on the body, turned to the world, carries the vehicle."""
-    attitude = relations.samples_of(log, quat)
-    force_b = relations.samples_of(log, "acc_b")
+    attitude = log.samples(quat)
+    force_b = log.samples("acc_b")
     if attitude is None or force_b is None:
         return
     sample = np.interp(attitude.time, force_b.time, np.arange(len(force_b.time)))
     nearest = force_b.values[np.round(sample).astype(int)]
     mean_w = np.mean(matrix_of_quat(attitude.values) @ nearest[..., None], axis=0)[:, 0]
-    path = relations.samples_of(log, pos)
-    vel_w = [] if path is None else relations.derivative(*path).values
+    path = log.samples(pos)
+    vel_w = [] if path is None else path.derivative().values
     if len(vel_w):
         mean_w = mean_w - (vel_w[-1] - vel_w[0]) / np.ptp(path.time)
     size = np.linalg.norm(mean_w)
@@ -307,22 +307,22 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
 
     Without an accelerometer the push is a multirotor's thrust, along body z, on vehicle and payload
     together."""
-    motion = relations.samples_of(log, path)
-    attitude = relations.samples_of(log, quat)
+    motion = log.samples(path)
+    attitude = log.samples(quat)
     if motion is None or attitude is None:
         return
-    time, acc = accelerations(*motion, log[path].unit)
+    time, acc = accelerations(motion, log[path].unit)
     if len(time) < 50 or _spread(acc) < _PUSHED:
         return
-    turn = relations.attitude_at(*attitude, time)
+    turn = attitude.attitudes(time)
     sensed = "acc_b" in log
     channels = f"d({path})/dt, {quat} {'acc_b' if sensed else 'thrust along z'}"
     if sensed:
         force_b = log["acc_b"].samples()
         if len(force_b.time) < 50 or sparse(force_b.time) or sparse(motion.time):
             return
-        force_w = rotate(relations.attitude_at(*attitude, force_b.time), force_b.values)
-        pushed = relations.mean_over(force_b.time, force_w - _UP, time, _SPAN)
+        force_w = rotate(attitude.attitudes(force_b.time), force_b.values)
+        pushed = Samples(force_b.time, force_w - _UP).mean_over(time, _SPAN)
     else:
         hangs, relative = _carried(log, quat, time, acc)
         if np.sum(hangs) < 50:
@@ -349,18 +349,18 @@ def _carried(
     """Return at which times the payload hangs on its cable, shape (N,), and its acceleration less
     the vehicle's [m/s^2], shape (N, 3); always and 0 where no payload is measured.
     """
-    place = relations.samples_of(log, quat.replace("quat_wb", "pos_w"), 1)
-    payload = relations.samples_of(log, "payload_pos_w")
+    place = log.samples(quat.replace("quat_wb", "pos_w"), 1)
+    payload = log.samples("payload_pos_w")
     if payload is None or place is None:
         return np.ones(len(time), bool), np.zeros_like(acc)
-    gap = relations.on_grid(*payload, time) - relations.on_grid(*place, time)
+    gap = payload.at(time) - place.at(time)
     length = np.linalg.norm(gap, axis=1)
-    stamps, acc_p = accelerations(*payload, "m")
-    if not len(stamps):
+    acc_p = accelerations(payload, "m")
+    if not len(acc_p.time):
         return np.zeros(len(time), bool), np.zeros_like(acc)
     hangs = np.abs(length - np.median(length)) < _TAUT * np.median(length)
-    hangs &= (time > stamps[0]) & (time < stamps[-1])
-    return hangs, relations.on_grid(stamps, acc_p, time) - acc
+    hangs &= (time > acc_p.time[0]) & (time < acc_p.time[-1])
+    return hangs, acc_p.at(time) - acc
 
 
 def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -403,7 +403,7 @@ def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row
     if len(grid) < 50:
         return None
     level = np.array([1.0, 1.0, 0.0])
-    measured = Samples(grid, level * relations.mean_over(*force_b, grid, 2.0 * _SPAN))
+    measured = Samples(grid, level * force_b.mean_over(grid, 2.0 * _SPAN))
     expected = Samples(grid, level * expected_b.values[known])
     relation = relations.relate(expected, measured, reach=_DELAY_BAD)
     if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
@@ -414,13 +414,12 @@ def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row
     return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
 
 
-def accelerations(time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN) -> Samples:
+def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
     """Return accelerations [m/s^2] of positions (unit m) or velocities, over about ``span`` seconds
     each.
     """
-    if unit == "m":
-        time, path = relations.derivative(time, path, span)
-    return relations.derivative(time, path, span)
+    velocities = path.derivative(span) if unit == "m" else path
+    return velocities.derivative(span)
 
 
 def _pushed(
@@ -466,7 +465,7 @@ def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
 
 def _still_gravity(log: FlightLog) -> Iterator[Row]:
     """Without an attitude: the size of the force, in its median."""
-    force_b = relations.samples_of(log, "acc_b", 20)
+    force_b = log.samples("acc_b", 20)
     if force_b is None or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
         return
     size = np.median(np.linalg.norm(force_b.values, axis=1))
@@ -486,7 +485,7 @@ def _commands(log: FlightLog) -> Iterator[Row]:
         rates = log["rate_b"].samples()
     elif "quat_wb" in log:
         turning = "rate of quat_wb"
-        rates = relations.rates_of(*log["quat_wb"].samples())
+        rates = log["quat_wb"].samples().rates()
     else:
         return
     if not usable(rates, MOVES):
@@ -575,8 +574,8 @@ def hangs(log: FlightLog, time: np.ndarray) -> np.ndarray:
 
 
 def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
-    place = relations.samples_of(log, "pos_w", 20)
-    payload = relations.samples_of(log, "payload_pos_w", 20)
+    place = log.samples("pos_w", 20)
+    payload = log.samples("payload_pos_w", 20)
     if place is None or payload is None:
         return
     time = payload.time
@@ -584,7 +583,7 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if "attached" in log:
         overlap &= log["attached"].hold(time).astype(bool)
     payload = Samples(time[overlap], payload.values[overlap])
-    gap = payload.values - relations.on_grid(*place, payload.time)
+    gap = payload.values - place.at(payload.time)
     channels = "pos_w, payload_pos_w"
     if len(gap) < 20:
         text = "vehicle and payload were never measured at one time"
@@ -661,7 +660,7 @@ def _payload_late(place: Samples, payload: Samples, channels: str) -> Iterator[R
     if np.sum(overlap) < 50:
         return
     time, pos = (array[overlap] for array in payload)
-    gaps = pos - relations.on_grid(*place, time - delays[:, None])
+    gaps = pos - place.at(time - delays[:, None])
     spread = np.std(np.linalg.norm(gaps, axis=2), axis=1)
     best = int(np.argmin(spread))
     delay = delays[best]
@@ -685,9 +684,9 @@ def _same(log: FlightLog) -> Iterator[Row]:
     """
     bad = False
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
-        a = relations.samples_of(log, first)
-        b = relations.samples_of(log, second)
-        if a is None or b is None or not (usable(a, MOVES) and usable(b, MOVES)):
+        a = log.samples(first)
+        b = log.samples(second)
+        if not (usable(a, MOVES) and usable(b, MOVES)):
             continue
         rows = list(_compared(a, b, f"{first}, {second}"))
         yield from rows

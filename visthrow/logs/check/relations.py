@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.polynomial import polyfit
 
-from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.samples import Samples
 
 REACH = 0.4  # largest delay looked for [s]
 # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
@@ -51,20 +50,6 @@ class Relation:
     nats: float  # by which that exchange beats the axes as they are, the choice among 48 paid for
 
 
-def samples_of(log: FlightLog, name: str, fewest: int = 50) -> Samples | None:
-    """Return the valid samples of a channel; None where a log holds fewer."""
-    if name not in log or np.sum(log[name].valid) < fewest:
-        return None
-    return log[name].samples()
-
-
-def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N),
-    shape (..., N, C).
-    """
-    return np.stack([np.interp(grid, time, column) for column in values.T], -1)
-
-
 def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | None:
     """Relate two signals of one or three components; ``reach``: largest delay [s].
 
@@ -92,11 +77,11 @@ def _related(
     first: Samples, second: Samples, grid: np.ndarray, period: float, steps: int
 ) -> tuple[Relation | None, np.ndarray]:
     """Relation at the times of a grid [s], and which of them go with the rest."""
-    values = on_grid(*first, grid)
+    values = first.at(grid)
     count = len(grid)
     centred = values - np.mean(values, axis=0)
     values = values - np.median(values, axis=0)
-    usual = np.median(on_grid(*second, grid), axis=0)
+    usual = np.median(second.at(grid), axis=0)
     edges = np.linspace(0, count, BLOCKS, endpoint=False).astype(int)
     lags = 2 * steps + 1
     sums = np.zeros((2, lags, BLOCKS))
@@ -104,7 +89,7 @@ def _related(
     norms = np.zeros(lags)
     power = np.sum(centred**2)
     for lag in range(lags):
-        moved = on_grid(*second, grid + (lag - steps) * period)
+        moved = second.at(grid + (lag - steps) * period)
         moved_centred = moved - np.mean(moved, axis=0)
         cross[:, :, lag] = centred.T @ moved_centred
         norms[lag] = np.sum(moved_centred**2)
@@ -252,49 +237,3 @@ def unit_hint(ratio: float) -> str:
         if ratio and abs(abs(np.log(abs(ratio))) - np.log(factor)) < _UNIT:
             return words
     return ""
-
-
-def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> Samples:
-    """Return the derivative over about ``span`` seconds, or two periods where these are longer;
-    gaps are left out.
-    """
-    first, last, middle, width = _pairs(time, span)
-    return Samples(middle, (values[last] - values[first]) / width[:, None])
-
-
-def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> Samples:
-    """Return body rates [rad/s] from attitudes xyzw, over about ``span`` seconds as in
-    :func:`derivative`.
-    """
-    first, last, middle, width = _pairs(time, span)
-    if not len(middle):
-        return Samples(middle, np.empty((0, 3)))
-    return Samples(middle, vectors_between(quat[first], quat[last]) / width[:, None])
-
-
-def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """First and last sample of each stretch of about ``span``, the time in its middle [s] and its
-    width [s].
-    """
-    period = np.median(np.diff(time)) if len(time) > 2 else 1.0
-    reach = max(1, round(0.5 * span / period))
-    first = np.arange(max(len(time) - 2 * reach, 0))
-    width = time[first + 2 * reach] - time[first]
-    whole = width < 2.5 * max(span, 2.0 * period)
-    first = first[whole]
-    last = first + 2 * reach
-    return first, last, 0.5 * (time[first] + time[last]), width[whole]
-
-
-def mean_over(time: np.ndarray, values: np.ndarray, times: np.ndarray, span: float) -> np.ndarray:
-    """Mean of a signal over ``span`` seconds about each time, shape (N, components)."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
-    whole = np.vstack([0.0 * values[:1], np.cumsum(steps, axis=0)])
-    begin, end = on_grid(time, whole, np.stack([times - 0.5 * span, times + 0.5 * span]))
-    return (end - begin) / span
-
-
-def attitude_at(time: np.ndarray, quat: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Attitudes between samples, unit quaternions, straight through those of the samples."""
-    between = on_grid(time, continuous(quat), times)
-    return between / np.linalg.norm(between, axis=1, keepdims=True)

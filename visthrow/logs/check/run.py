@@ -92,7 +92,7 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     log = _until_landing(log)
     yield from _reader(log)
     for name, channel in log.channels.items():
-        yield from signals.look(name, channel, signals.notes_of(log, name))
+        yield from signals.look(name, channel, log.notes(name))
     yield from _clocks(log)
     usable = {}
     for name, channel in log.channels.items():
@@ -138,7 +138,7 @@ def _reader(log: FlightLog) -> Iterator[Row]:
     for part in log.meta.get("left_out", ()):
         yield Row("gaps", "", "warn", f"left out: {part}")
     for name in log.channels:
-        notes = signals.notes_of(log, name)
+        notes = log.notes(name)
         if flagged := notes.get("invalid by the source"):
             text = (
                 f"{100 * flagged / len(log[name].time):.0f} % of the samples are not valid by the"
@@ -153,7 +153,7 @@ def _reader(log: FlightLog) -> Iterator[Row]:
 def _clocks(log: FlightLog) -> Iterator[Row]:
     clocks: dict[str, list[str]] = {}
     for name in log.channels:
-        clock = str(signals.notes_of(log, name).get("clock", "main"))
+        clock = str(log.notes(name).get("clock", "main"))
         clocks.setdefault(clock, []).append(name)
     if len(clocks) > 1:
         listed = "; ".join(f"{name}: {', '.join(channels)}" for name, channels in clocks.items())
@@ -199,19 +199,19 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
     """Compare the clocks of several vehicles that carry one payload."""
     paths = {}
     for i, log in enumerate(logs):
-        path = relations.samples_of(log, "payload_pos_w", 101)
+        path = log.samples("payload_pos_w", 101)
         if path is not None and len(paths) < _MOST_PAIRED:
             paths[i] = path
     for (first, a), (second, b) in combinations(paths.items(), 2):
         if not (physics.usable(a, physics.MOVES) or physics.usable(b, physics.MOVES)):
             continue
         # on a straight path an offset of positions looks like a delay; velocities have none
-        relation = relations.relate(relations.derivative(*a), relations.derivative(*b))
+        relation = relations.relate(a.derivative(), b.derivative())
         if relation is None or relation.delay_sd > physics.DELAY_KNOWN:
             continue
         late_time = a.time + relation.delay
         common = (late_time > b.time[0]) & (late_time < b.time[-1])
-        difference = a.values[common] - relations.on_grid(*b, late_time[common])
+        difference = a.values[common] - b.at(late_time[common])
         off = np.sqrt(np.mean(difference**2)) if np.any(common) else np.inf
         if off < _ONE_PAYLOAD:
             text = f"the payload of {label(logs[first], first)} to {1e3 * off:.1f} mm, "

@@ -8,7 +8,7 @@ import numpy as np
 
 from visthrow.common.rotations import continuous
 from visthrow.logs.check.rows import Row
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel
 
 MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
@@ -299,8 +299,3 @@ def _noise(name: str, channel: Channel) -> Iterator[Row]:
     if known and channel.values.dtype.kind != "b":
         text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
         yield Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})
-
-
-def notes_of(log: FlightLog, name: str) -> dict:
-    """Return the reader's notes on a channel."""
-    return log.meta.get("ingest", {}).get(name, {})

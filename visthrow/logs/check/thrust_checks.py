@@ -20,7 +20,8 @@ from visthrow.logs.check.physics import (
     usable,
 )
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import nearest
 
 INPUTS = (
@@ -75,7 +76,7 @@ def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Sam
     Returns channel and thrust, shape (N, 1), in newtons where channel or map say so; None where it
     says nothing."""
     name = vehicle.thrust_input or next((name for name in INPUTS if name in log), "")
-    driver = relations.samples_of(log, name)
+    driver = log.samples(name)
     if driver is None:
         return None
     values = driver.values
@@ -104,13 +105,13 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     log does not tell.
     """
     thrust_signal = thrust_of(log, vehicle)
-    force_b = relations.samples_of(log, "acc_b")
+    force_b = log.samples("acc_b")
     if thrust_signal is None or force_b is None:
         return None
     name, (time, thrust) = thrust_signal
     if vehicle.thrust_map is None and name not in ("command", "thrust_command"):
         return None  # not in newtons
-    acc = relations.on_grid(*force_b, time)[:, 2]
+    acc = force_b.at(time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
     carries = hangs(log, time)
     if np.any(flies & carries):  # without its payload it is another mass
@@ -203,18 +204,18 @@ def _along_z(log: FlightLog, measurement: str) -> Samples | None:
     path.
     """
     if measurement == "acc_b":
-        force_b = relations.samples_of(log, "acc_b")
+        force_b = log.samples("acc_b")
         if force_b is None or sparse(log["acc_b"].time):
             return None
         return Samples(force_b.time, force_b.values[:, 2:3])
     path = next((n for n in ("vel_w", "pos_w") if n in log), None)
-    attitude = relations.samples_of(log, "quat_wb")
+    attitude = log.samples("quat_wb")
     if path is None or attitude is None:
         return None
-    time, acc = accelerations(*log[path].samples(), log[path].unit)
+    time, acc = accelerations(log[path].samples(), log[path].unit)
     if len(time) < 50:
         return None
-    turn = relations.attitude_at(*attitude, time)
+    turn = attitude.attitudes(time)
     return Samples(time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3])
 
 
@@ -241,8 +242,8 @@ def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.nd
         grid = grid[steady]
         if len(grid) < 200:
             continue
-        x = relations.mean_over(*command, grid, _SPAN)[:, 0]
-        y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
+        x = command.mean_over(grid, _SPAN)[:, 0]
+        y = np.array([force.mean_over(grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
         splits = np.flatnonzero(np.diff(load[steady])) + 1
         xs = np.split(x, splits)
         ys = np.split(y, splits, axis=1)
@@ -312,7 +313,7 @@ def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
 def _rotors(log: FlightLog) -> Iterator[Row]:
     """Each rotor against the others: a vehicle that hovers turns all of them alike."""
     for name in ROTORS:
-        motors = relations.samples_of(log, name)
+        motors = log.samples(name)
         if motors is None or log[name].values.shape[1:] != (4,):
             continue
         total = np.mean(motors.values, axis=1)
@@ -340,13 +341,11 @@ def _uneven(ratio: float) -> str:
 def _turning(log: FlightLog) -> Iterator[Row]:
     """Which way the vehicle turns when motors differ: order of the motors, and sign."""
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), "")
-    motors = relations.samples_of(log, name)
-    rate = relations.samples_of(log, "rate_b")
-    if motors is None or rate is None or log[name].values.shape[1:] != (4,):
+    motors = log.samples(name)
+    rate = log.samples("rate_b")
+    if motors is None or not usable(rate, MOVES) or log[name].values.shape[1:] != (4,):
         return
-    if not usable(rate, MOVES):
-        return
-    time_d, turning = relations.derivative(*rate, 0.03)
+    time_d, turning = rate.derivative(0.03)
     front_left, front_right, rear_left, rear_right = motors.values.T
     roll = front_left + rear_left - front_right - rear_right
     pitch = rear_left + rear_right - front_left - front_right

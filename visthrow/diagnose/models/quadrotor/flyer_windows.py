@@ -13,8 +13,8 @@ from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import cross, normal_part, rotate
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
-from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
-from visthrow.logs.flightlog import Channel, FlightLog, Samples
+from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.samples import Samples
 
 # noise below which none is believed; of other channels 1e-4
 LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
@@ -93,14 +93,14 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
         if len(stamps) < 5 or np.min(positions[:, 2]) < params.lowest:
             continue
         times = start + row * rows
-        quat = attitude_at(*log[params.attitude].samples(), times)
-        rate = on_grid(*rates_of(times, quat, params.step), times)
+        quat = log[params.attitude].samples().attitudes(times)
+        rate = Samples(times, quat).rates(params.step).at(times)
         lean = _lean(log, params.attitude, params.estimator_rate, times)
         by_name = dict(zip(model.channels, tables))
         guess, spread, direction = _guess(by_name, params, quat[margin], rate[margin])
         data = common | {"turned": np.hstack((quat, rate, lean)), "direction": direction}
         if NEIGHBOUR in log:
-            data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times[margin:])
+            data[NEIGHBOUR] = log[NEIGHBOUR].samples().at(times[margin:])
         span = start, start + params.window
         stretches.append(model.lay_out(number, "flight", tables, span, data, guess, spread))
     return stretches
@@ -200,8 +200,8 @@ def _offset(log: FlightLog, attitude: str) -> ndarray:
     """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape
     (3,).
     """
-    time, rate = rates_of(*log[attitude].samples())
-    gyro = mean_over(*log["rate_b"].samples(), time, 0.06)
+    time, rate = log[attitude].samples().rates()
+    gyro = log["rate_b"].samples().mean_over(time, 0.06)
     return np.median(gyro - rate, axis=0)
 
 

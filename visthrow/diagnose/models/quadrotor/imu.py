@@ -16,8 +16,9 @@ from visthrow.diagnose.models.numeric import Lanes, Stretch, halves, integrate
 from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import cut_flying
-from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
-from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.check.relations import Relation, relate
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples, on_grid
 
 CHANNELS = ("acc_b", "rate_b")
 COLUMNS = slice(3, 4), slice(0, 3)  # of the state that these channels show
@@ -131,7 +132,7 @@ def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
         return None
     time, inputs = log[params.input].samples()
     sent = params.torque.of(params.thrust(inputs)) / params.torque.inertia
-    return relate(Samples(time, sent), derivative(*log["rate_b"].samples(), SMOOTHING))
+    return relate(Samples(time, sent), log["rate_b"].samples().derivative(SMOOTHING))
 
 
 def _why_not(turned: Sequence[Relation], source: str) -> str:
