@@ -165,8 +165,8 @@ def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
         return table.logs_of(columns, mapping, str(path))
     if channels.is_decoded(columns):
         return [channels.log_of_decoded(columns, path)]
-    if table.is_export(columns):
-        return [table.log_of_export(columns, path)]
+    if (exported := table.log_of_export(columns, path)) is not None:
+        return [exported]
     names = ", ".join(list(columns)[:12])
     raise LogError(
         f"{path}: a table with the columns {names}, ...: it needs a mapping; give --config NAME"

@@ -11,8 +11,8 @@ from visthrow.logs.axes import turn_of
 from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
 from visthrow.logs.unit_names import to_si
 
-_ORDERS = ("xyzw", "wxyz")
-_WIDTH = {"quaternion": (4,), "euler": (3,), "rotvec": (3,), "matrix": (9,), "vector": None}
+_WIDTH = {"quaternion": 4, "euler": 3, "rotvec": 3, "matrix": 9}
+"""Kind of an attitude -> number of its columns."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ChannelMap(Bounded):
     # euler: roll, pitch, yaw; yaw is turned first. rotvec: axis times angle. matrix: nine numbers,
     # column after column
     kind: Literal["vector", "quaternion", "euler", "rotvec", "matrix"] = "vector"
-    order: str = "xyzw"  # of a quaternion's columns
+    order: Literal["xyzw", "wxyz"] = "xyzw"  # of a quaternion's columns
     # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
     axes: str = ""
     body_axes: str = ""  # of an attitude: our body's x, y, z in the source's body axes
@@ -72,13 +72,10 @@ class ChannelMap(Bounded):
         to_si(self.unit, where)
         if not self.columns:
             raise ConfigError(f"{where}: no columns")
-        width = _WIDTH[self.kind]
-        if width and len(self.columns) not in width:
-            raise ConfigError(
-                f"{where}: {self.kind} of {len(self.columns)} columns; expected {width[0]}"
-            )
-        if self.order not in _ORDERS:
-            raise ConfigError(f"{where}: order '{self.order}'; {suggest(self.order, _ORDERS)}")
+        count = len(self.columns)
+        width = _WIDTH.get(self.kind, count)
+        if count != width:
+            raise ConfigError(f"{where}: {self.kind} of {count} columns; expected {width}")
         if self.frame and self.frame not in FRAMES:
             raise ConfigError(f"{where}: frame '{self.frame}'; {suggest(self.frame, FRAMES)}")
         for axes in (self.axes, self.body_axes):
@@ -92,7 +89,11 @@ class ChannelMap(Bounded):
             return
         ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
         if ours not in spec.unit.split(", "):
-            kinds = f"; expected kind, one of {', '.join(_WIDTH)}" if "quat" in self.name else ""
+            kinds = (
+                f"; expected kind, one of {', '.join(_WIDTH)}, vector"
+                if "quat" in self.name
+                else ""
+            )
             raise ConfigError(
                 f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in"
                 f" '{spec.unit}'{kinds}"

@@ -93,7 +93,7 @@ class Recognition:
         self.questions: list[str] = []
         self.why: dict[str, str] = {}
         for group in groups:
-            group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
+            group.values = np.where(lost_rows(group.values)[:, None], np.nan, group.values)
         self._groups = [group for group in groups if moves(group.values)]
         self._taken: set[tuple[str, ...]] = set()
         self._made: dict[str, tuple[ChannelMap, Channel]] = {}

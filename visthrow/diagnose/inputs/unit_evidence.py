@@ -16,6 +16,7 @@ from visthrow.logs.check import physics
 from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel
 from visthrow.logs.mapping import ChannelMap
+from visthrow.logs.readers.table import forward_rows
 from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
@@ -206,8 +207,6 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
 
 
 def rising(time: np.ndarray, path: np.ndarray) -> Samples:
-    """Rows that are numbers, later than those before."""
-    good = np.isfinite(time) & np.all(np.isfinite(path), axis=1)
-    time = time[good]
-    later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
-    return Samples(time[later], path[good][later])
+    """Rows that are numbers and leave the clock going on."""
+    rows = forward_rows(np.where(np.all(np.isfinite(path), axis=1), time, np.nan))
+    return Samples(time[rows], path[rows])

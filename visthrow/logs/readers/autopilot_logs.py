@@ -169,17 +169,23 @@ def _channel(
         if count > len(entry.columns):
             left_out.append(f"{tap.message}: {count} motors move, not the four of a quadrotor")
             return None
-    with np.errstate(invalid="ignore"):  # damaged floats
-        values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
-    bad = ~valid_rows(fields, tap.good)
-    channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
+    channel, notes = _read(tap, entry, fields, source)
     notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
-    if np.any(bad):
+    if notes["invalid by the source"]:
         notes["flagged"] = ", ".join(flag for flag in tap.good.split() if flag in fields)
     resets = [int(np.sum(np.diff(fields[name]) != 0)) for name in RESETS if name in fields]
     if sum(resets):
         notes["resets"] = sum(resets)
     return channel, notes
+
+
+def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Channel, dict]:
+    """Read a channel of the fields of a tap, and notes on it."""
+    with np.errstate(invalid="ignore"):  # damaged floats
+        values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
+    if entry.name == "vel_w" and "velocity_frame" in fields:
+        values = _in_world(values, fields)
+    return make_channel(fields["time"], values, entry, source, ~valid_rows(fields, tap.good))
 
 
 def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -> FlightLog:
@@ -264,11 +270,7 @@ def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     a position keeps those that are not valid.
     """
     entry = replace(tap.entry(Vehicle()), name=part, axes="", body_axes="")
-    values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
-    if part == "vel_w" and "velocity_frame" in fields:
-        values = _in_world(values, fields)
-    bad = ~valid_rows(fields, tap.good)
-    channel, _ = make_channel(fields["time"], values, entry, source, bad)
+    channel, _ = _read(tap, entry, fields, source)
     return channel if part == "pos_w" else channel.only(np.asarray(channel.valid))
 
 

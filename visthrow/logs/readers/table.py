@@ -300,13 +300,21 @@ def make_channel(
     """
     spec = STANDARD_CHANNELS.get(entry.name)
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
-    rows, notes = _stamped(time)
+    rows = forward_rows(time)
+    finite = np.isfinite(time)
+    steps = np.diff(time[finite])
+    notes = {
+        "rows": len(time),
+        "unstamped": int(np.sum(~finite)),
+        "repeated": int(np.sum(steps == 0.0)),
+        "backwards": int(np.sum(steps < 0.0)),
+    }
     blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
     notes["blank"] = int(np.sum(blank))
     time = time[rows[~blank]]
     values = values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
-    valid &= ~lost_rows(time, values)
+    valid &= ~lost_rows(values)
     if bad is not None:
         valid &= ~bad[rows[~blank]]
         notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
@@ -340,44 +348,31 @@ def _changed(values: np.ndarray) -> np.ndarray:
     return np.append(True, ~np.all(same, axis=1))
 
 
-def _stamped(time: np.ndarray) -> tuple[np.ndarray, dict]:
-    """Rows that leave a clock going on, by number, and how many others there are."""
-    rows = np.flatnonzero(np.isfinite(time))
-    steps = np.diff(time[rows])
-    notes = {
-        "rows": len(time),
-        "unstamped": len(time) - len(rows),
-        "repeated": int(np.sum(steps == 0.0)),
-        "backwards": int(np.sum(steps < 0.0)),
-    }
-    return rows[_forward(time[rows])], notes
-
-
-def _forward(time: np.ndarray) -> np.ndarray:
-    """Rows that leave a clock going on, bool, shape (T,): those later than all before, or those
-    earlier than all that follow, whichever are more.
+def forward_rows(stamps: np.ndarray) -> np.ndarray:
+    """Return the numbers of the rows that leave a clock going on: those later than all before, or
+    those earlier than all that follow, whichever are more; rows without a stamp are left out.
     """
+    rows = np.flatnonzero(np.isfinite(stamps))
+    time = stamps[rows]
     later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
-    follow = np.minimum.accumulate(time[::-1])[::-1]
-    earlier = np.append(time[:-1] < follow[1:], True) if len(time) else later
-    return earlier if np.sum(earlier) > np.sum(later) else later
+    earlier = np.diff(np.minimum.accumulate(time[::-1])[::-1], append=np.inf) > 0.0
+    return rows[earlier if np.sum(earlier) > np.sum(later) else later]
 
 
-def lost_rows(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+def lost_rows(values: np.ndarray) -> np.ndarray:
     """Tell rows of three or more columns that are all zero where the body jumps to and from them:
-    a capture's word for a body that it does not see. Shapes (T,) and (T, C); returns bool, (T,).
+    a capture's word for a body that it does not see. Shape (T, C); returns bool, shape (T,).
     """
     zero = np.all(values == 0.0, axis=1)
-    if values.shape[1] < 3 or not np.any(zero) or np.all(zero) or len(time) != len(values):
+    if values.shape[1] < 3 or not np.any(zero) or np.all(zero):
         return np.zeros(len(values), bool)
     size = np.linalg.norm(np.nan_to_num(values), axis=1)
     usual = np.percentile(np.abs(np.diff(size[~zero])), 99) if np.sum(~zero) > 2 else 0.0
-    starts = np.flatnonzero(zero & ~np.append(False, zero[:-1]))
-    ends = np.flatnonzero(zero & ~np.append(zero[1:], False))
+    edges = np.flatnonzero(np.diff(zero, prepend=False, append=False))
     lost = np.zeros(len(values), bool)
-    for start, end in zip(starts, ends):
-        neighbours = [i for i in (start - 1, end + 1) if 0 <= i < len(size)]
-        lost[start : end + 1] = all(size[i] > 10.0 * usual for i in neighbours)
+    for start, end in edges.reshape(-1, 2):
+        neighbours = np.append(size[:start][-1:], size[end : end + 1])
+        lost[start:end] = np.all(neighbours > 10.0 * usual)
     return lost
 
 
@@ -405,30 +400,23 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
     return np.stack(multiply(multiply(world, quat.T), body), -1)
 
 
-def is_export(table: Table) -> bool:
-    """Tell whether a table is one of :func:`visthrow.logs.export.export`."""
-    return "time [s]" in table and all(
-        _EXPORTED.fullmatch(name) for name in table if name != "time [s]"
-    )
-
-
-def log_of_export(table: Table, path: Path) -> FlightLog:
-    """Read back a table that :func:`visthrow.logs.export.export` wrote; parquet carries the
-    metadata.
+def log_of_export(table: Table, path: Path) -> FlightLog | None:
+    """Read back a table that :func:`visthrow.logs.export.export` wrote, None for another one;
+    parquet carries the metadata.
 
     Raises LogError: columns of one channel do not fit together.
     """
+    names = [_EXPORTED.fullmatch(column) for column in table if column != "time [s]"]
+    if "time [s]" not in table or not all(names):
+        return None
     time = _numbers(table, "time [s]", str(path))
     read = {}
     channels = {}
-    for column in table:
-        match = _EXPORTED.fullmatch(column)
-        if column != "time [s]":
-            index = tuple(map(int, match["index"].split(","))) if match["index"] else ()
-            place = match["unit"], match["frame"] or "none"
-            read.setdefault(match["name"], (place, {}))[1][index] = _numbers(
-                table, column, str(path)
-            )
+    for match in names:
+        index = tuple(map(int, match["index"].split(","))) if match["index"] else ()
+        place = match["unit"], match["frame"] or "none"
+        cells = read.setdefault(match["name"], (place, {}))[1]
+        cells[index] = _numbers(table, match[0], str(path))
     try:
         for name, (place, cells) in read.items():
             spec = STANDARD_CHANNELS.get(name)

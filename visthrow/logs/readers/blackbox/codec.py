@@ -5,6 +5,7 @@ Source: Betaflight, "Blackbox logging internals" (docs/development/Blackbox Inte
 version 2."""
 
 from collections.abc import Callable
+from itertools import takewhile
 
 import numpy as np
 
@@ -147,14 +148,9 @@ def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Decoder, int, 
             i += 1
             continue
         code = encodings[i]
-        count = 1
+        together = encodings[i : i + _GROUP.get(code, 1)]
         if code == TAG8_8SVB:
-            while (
-                count < _GROUP[code] and i + count < len(encodings) and encodings[i + count] == code
-            ):
-                count += 1
-        elif code in _GROUP:
-            count = min(_GROUP[code], len(encodings) - i)
-        groups.append((DECODERS[code], i, count))
-        i += count
+            together = list(takewhile(code.__eq__, together))
+        groups.append((DECODERS[code], i, len(together)))
+        i += len(together)
     return groups

@@ -140,7 +140,11 @@ class _Decoder:
     def _prepare(self) -> None:
         if "I" not in self.fields or "P" not in self.fields:
             raise LogError("its header does not define I and P frames")
-        self.fields["P"].names = self.fields["I"].names
+        names = self.fields["I"].names
+        missing = {"time", "loopIteration"}.difference(names)
+        if missing:
+            raise LogError(f"its I frames have no field {' or '.join(sorted(missing))}")
+        self.fields["P"].names = names
         self.fields["P"].signed = self.fields["I"].signed
         if self.header.get("Data version", "2") != "2":
             raise LogError(f"data version {self.header['Data version']}; expected version 2")
@@ -160,10 +164,9 @@ class _Decoder:
             kind: plan(definition.encoding, [p == INC for p in definition.predictor])
             for kind, definition in self.fields.items()
         }
-        place = {name: i for i, name in enumerate(self.fields["I"].names)}
-        self.at_time = place.get("time")
-        self.at_iteration = place.get("loopIteration")
-        self.at_motor0 = place.get("motor[0]")
+        self.at_time = names.index("time")
+        self.at_iteration = names.index("loopIteration")
+        self.at_motor0 = names.index("motor[0]") if "motor[0]" in names else None
         output = _numbers(self.header.get("motorOutput", "0"), "motorOutput")
         self.constant = {
             MINTHROTTLE: _int(self.header, "minthrottle"),
@@ -225,10 +228,8 @@ class _Decoder:
             self.history = []
             return []
         self.history = [values, values] if kind == "I" else [values, self.history[0]]
-        if self.at_time is not None:
-            self.last_time = values[self.at_time]
-        if self.at_iteration is not None:
-            self.last_iteration = values[self.at_iteration]
+        self.last_time = values[self.at_time]
+        self.last_iteration = values[self.at_iteration]
         return values
 
     def _noted(self, log: BlackboxLog) -> Frame | None:
@@ -291,15 +292,13 @@ class _Decoder:
         """Whether time and iteration go on; one I frame that jumps is refused, and the next one
         believed wherever it stands.
         """
-        steps = []
-        if self.at_time is not None and self.last_time is not None:
-            passed = values[self.at_time] - self.last_time
-            if passed < -(1 << 31):  # the 32-bit clock turned over
-                passed += 1 << 32
-            steps.append((passed, _LONGEST_GAP_US))
-        if self.at_iteration is not None and self.last_iteration is not None:
-            steps.append((values[self.at_iteration] - self.last_iteration, _MOST_ITERATIONS))
-        if all(0 <= passed <= limit for passed, limit in steps):
+        if self.last_time is None:
+            return True
+        passed = values[self.at_time] - self.last_time
+        if passed < -(1 << 31):  # the 32-bit clock turned over
+            passed += 1 << 32
+        iterations = values[self.at_iteration] - self.last_iteration
+        if 0 <= passed <= _LONGEST_GAP_US and 0 <= iterations <= _MOST_ITERATIONS:
             return True
         if kind == "I":
             self.last_time = self.last_iteration = None
