@@ -76,13 +76,9 @@ def _axes(
     """Return a figure so wide [inch] with axes for ``count`` panels, each row so high, and some
     room more.
     """
-    style.use()
-    import matplotlib.pyplot as plt
-
     rows = -(-count // columns)
-    how = {"layout": "constrained", "squeeze": False, "sharex": sharex, "sharey": True}
     size = (width, height * rows + margin)
-    figure, axes = plt.subplots(rows, columns, figsize=size, **how)
+    figure, axes = style.subplots(rows, columns, size, sharex=sharex, sharey=True)
     for axis in axes.flat[count:]:
         axis.set_visible(False)
     return figure, axes
@@ -106,13 +102,10 @@ def marks(
     """Values with intervals, one below the other; crosses stand for the paper's, a line at ``zero``
     for what they are compared with.
     """
-    style.use()
-    import matplotlib.pyplot as plt
-
     names = list(dict.fromkeys(row.label for row in rows))
     count = len({row.series for row in rows})
     height = 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)
-    figure, axis = plt.subplots(figsize=(WIDTH, height), layout="constrained")
+    figure, axis = style.single((WIDTH, height))
     handles = {}
     for row in rows:
         (colour, marker) = _look(row.series)
@@ -145,13 +138,11 @@ def marks(
 
 
 def _log_axis(axis, name: str) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    getattr(axis, f"set_{name}scale")("log")
+    axis.set(**{f"{name}scale": "log"})
     which = getattr(axis, f"{name}axis")
-    which.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    which.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    which.set_minor_formatter(NullFormatter())
+    which.get_major_locator().set_params(subs=(1.0, 2.0, 5.0))
+    which.set_major_formatter("{x:g}")
+    which.set_minor_formatter("")
 
 
 def scatter(

@@ -47,3 +47,20 @@ def use() -> None:
 
     matplotlib.use("Agg")
     matplotlib.style.use(Path(__file__).with_name("data") / "pictures.mplstyle")
+
+
+def subplots(rows: int, columns: int, size: tuple[float, float], **how: Any) -> tuple[Any, Any]:
+    """Return a figure in this style and its axes, shape (rows, columns); ``size``: width and height
+    [inch].
+    """
+    use()
+    import matplotlib.pyplot as plt
+
+    how = {"layout": "constrained", "squeeze": False, **how}
+    return plt.subplots(rows, columns, figsize=size, **how)
+
+
+def single(size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure in this style with one axes, and these."""
+    figure, axes = subplots(1, 1, size)
+    return figure, axes[0, 0]

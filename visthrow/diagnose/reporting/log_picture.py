@@ -29,14 +29,11 @@ _SHADE = {"ok": style.COLOURS[2], "warn": style.COLOURS[4], "bad": style.COLOURS
 
 def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     """Write the picture."""
-    style.use()
-    import matplotlib.pyplot as plt
-
     ordered = dict.fromkeys((*_FIRST, *log.channels))
     names = [name for name in ordered if name in log and len(log[name].time) > 1][:CHANNELS_DRAWN]
     rows = max(len(names), 1)
     size = (9, 1.1 + 1.25 * rows)
-    figure, axes = plt.subplots(rows, 1, figsize=size, sharex=True, squeeze=False)
+    figure, axes = style.subplots(rows, 1, size, sharex=True, layout=None)
     for axis, name in zip(axes[:, 0], names):
         _channel(axis, log[name])
         concern = [row for row in checked.rows if name in row.channel.replace(",", " ").split()]

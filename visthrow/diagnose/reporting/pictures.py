@@ -34,21 +34,6 @@ STEPS_ACROSS = 3
 NAMES_ACROSS = 26  # letters in a line of a set's names
 
 
-def _figure(rows: int, columns: int, height: float, **options):
-    import matplotlib.pyplot as plt
-
-    style.use()
-    size = (WIDTH, height)
-    how = {"layout": "constrained", "squeeze": False, **options}
-    return plt.subplots(rows, columns, figsize=size, **how)
-
-
-def _single(height: float):
-    """Return a figure with one axes, and these."""
-    figure, axes = _figure(1, 1, height)
-    return figure, axes[0, 0]
-
-
 def _with_legend(figure) -> bytes:
     """Return the PNG of a figure, the labels of its first axes above it, each once."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -89,7 +74,7 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
 
     ``rates``: expected nats a second of manoeuvres by their name.
     """
-    figure, axes = _figure(3, 3, 6.2)
+    figure, axes = style.subplots(3, 3, (WIDTH, 6.2))
     for r, colour in ((base, style.BEFORE), (designed, style.AFTER)):
         percent = 100.0 * (r.thrust_factor - 1.0)
         columns = np.column_stack((r.pos_w, np.degrees(r.yaw), percent, r.rates_b)).T
@@ -120,7 +105,7 @@ def residuals(work: Work, channel: int) -> bytes:
     pairs.sort(key=lambda pair: -pair[0])
     usual = pairs[len(pairs) // 2]
     chosen = [*pairs[: SHOWN_WINDOWS - 1], usual] if len(pairs) >= SHOWN_WINDOWS else pairs
-    figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
+    figure, axes = style.subplots(1, len(chosen), (WIDTH, 2.9), sharey=True)
     for axis, (_, before, rows, old, new) in zip(axes[0], chosen):
         time = before.time[rows]
         noise = factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
@@ -140,7 +125,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
     columns = min(len(steps), STEPS_ACROSS)
     down = -(-len(steps) // columns)
     height = max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps)
-    figure, axes = _figure(down, columns, down * (0.55 + 0.27 * height))
+    figure, axes = style.subplots(down, columns, (WIDTH, down * (0.55 + 0.27 * height)))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
     for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
@@ -176,7 +161,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
         result.NOT_IDENTIFIABLE: style.COLOURS[4],
     }
     findings = [f for f in diagnosis.findings if f.verdict in colours][::-1]
-    figure, axis = _single(0.8 + 0.19 * len(findings))
+    figure, axis = style.single((WIDTH, 0.8 + 0.19 * len(findings)))
     axis.axvspan(-1.0, 1.0, **LOOKS["negligible"])
     for y, f in enumerate(findings):
         colour = colours[f.verdict]
@@ -196,7 +181,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
 
 def horizons(gain: Gain) -> bytes:
     """Prediction error over the horizon on held-out flights."""
-    figure, axes = _figure(1, len(gain.channels), 2.9)
+    figure, axes = style.subplots(1, len(gain.channels), (WIDTH, 2.9))
     for axis, channel in zip(axes[0], gain.channels):
         h, before, after, floor = np.array(channel.horizons).T
         axis.plot(h, before, marker="^", **LOOKS["before"])
@@ -212,7 +197,7 @@ def horizons(gain: Gain) -> bytes:
 
 def landings(landing: LandingGain) -> bytes:
     """Draw where each throw was predicted to land, relative to where it landed."""
-    figure, axis = _single(3.6)
+    figure, axis = style.single((WIDTH, 3.6))
     before = 1e3 * np.array(landing.off_before)
     after = 1e3 * np.array(landing.off_after)
     axis.plot(*before.T, **LOOKS["landing_before"], **LOOKS["before"])
@@ -237,7 +222,7 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     strongest[np.isin(visible, work.active)] = 2.0
     strongest_effects = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
     names = [work.problem.model.effects[j].name for j in visible[strongest_effects]]
-    figure, axis = _single(1.6 + 0.3 * len(strongest_effects))
+    figure, axis = style.single((WIDTH, 1.6 + 0.3 * len(strongest_effects)))
     block = correlation[np.ix_(strongest_effects, strongest_effects)]
     image = axis.imshow(block, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
     for (i, j), value in np.ndenumerate(block):
@@ -256,7 +241,7 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
     pairs.sort(key=lambda pair: np.nan_to_num(pair[0].limit / pair[1], nan=np.inf), reverse=True)
-    figure, axis = _single(0.8 + 0.17 * len(pairs))
+    figure, axis = style.single((WIDTH, 0.8 + 0.17 * len(pairs)))
     for y, (curve, floor) in enumerate(pairs):
         sizes = np.array(curve.sizes) / floor
         share = np.maximum.accumulate(curve.up_to_class)
