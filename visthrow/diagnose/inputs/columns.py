@@ -22,7 +22,7 @@ _BRACKETS = re.compile(r"^(.+?)\s*[\[(]\s*([^\d\[\]()][^\[\]()]*|)\s*[\])]$")
 _NUMBERED = re.compile(r"^(.*?)[._\[]?([0-8])\]?$")
 
 
-@dataclass
+@dataclass(eq=False)
 class Group:
     """Columns that belong together."""
 

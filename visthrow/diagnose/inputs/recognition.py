@@ -94,9 +94,10 @@ class Recognition:
         self.why: dict[str, str] = {}
         for group in groups:
             group.values = np.where(lost_rows(group.values)[:, None], np.nan, group.values)
-        self._groups = [group for group in groups if moves(group.values)]
-        self._taken: set[tuple[str, ...]] = set()
-        self._made: dict[str, tuple[ChannelMap, Channel]] = {}
+        self._groups = [group for group in groups if moves(group.values)]  # that no channel has
+        self._entries: dict[str, ChannelMap] = {}
+        self._channels: dict[str, Channel] = {}
+        self._sources: dict[str, Group] = {}  # of the channels
 
     def channels(self) -> list[ChannelMap]:
         """Recognise what can be, the vehicle's attitude and path first."""
@@ -110,31 +111,25 @@ class Recognition:
         self._single_columns()
         self._thrust()
         self._ask_what_is_open()
-        return [entry for entry, _ in self._made.values()]
+        return list(self._entries.values())
 
     def _open(self, size: int, targets: bool = False) -> list[Group]:
         """Groups of so many columns that no channel has; ``targets``: those of set-points too."""
         return [
             group
             for group in self._groups
-            if group.columns not in self._taken
-            and len(group.columns) == size
-            and (targets or not group.matches("target"))
+            if len(group.columns) == size and (targets or not group.matches("target"))
         ]
 
     def _hinting(self, kind: str) -> list[Group]:
         """Groups of three columns that no channel has and whose names hint at a kind."""
         return [group for group in self._open(3) if group.hints_at(kind)]
 
-    def _group(self, name: str) -> Group:
-        """Group that a channel was made of."""
-        return next(g for g in self._groups if g.columns == self._made[name][0].columns)
-
     def _take(self, name: str, group: Group, unit: str, why: str, **options: Any) -> bool:
         """Make a channel of a group, unless its units contradict what the name stands for;
         ``options``: of its :class:`ChannelMap`.
         """
-        if name in self._made:
+        if name in self._entries:
             return False
         values = group.values
         held = bool(np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5)
@@ -144,8 +139,10 @@ class Recognition:
             channel, _ = make_channel(self.time, values, entry, "table")
         except (ConfigError, LogError):
             return False
-        self._taken.add(group.columns)
-        self._made[name] = entry, channel
+        self._groups.remove(group)
+        self._entries[name] = entry
+        self._channels[name] = channel
+        self._sources[name] = group
         self.why[name] = why + ("; its values are held between measurements" if held else "")
         return True
 
@@ -157,7 +154,7 @@ class Recognition:
             name = "quat_wb"
             if group.matches("not_vehicle"):
                 name = "marker_quat_c" if group.matches("camera") else "payload_quat_wb"
-            elif name in self._made and group.matches("estimate"):
+            elif name in self._entries and group.matches("estimate"):
                 name = "est_quat_wb"
             largest = np.argmax(np.nanmean(np.abs(group.values), axis=0))
             order = "xyzw" if _lettered(group) or largest == 3 else "wxyz"
@@ -185,10 +182,10 @@ class Recognition:
 
     def _attitudes(self) -> list[Attitude | None]:
         """All ways to read the columns of the vehicle's attitude, None where it has none."""
-        if "quat_wb" not in self._made:
+        if "quat_wb" not in self._entries:
             return [None]
-        entry, _ = self._made["quat_wb"]
-        group = self._group("quat_wb")
+        entry = self._entries["quat_wb"]
+        group = self._sources["quat_wb"]
         motive = "Format Version" in self.settings
         open_unit = entry.kind == "euler" and not group.unit and entry.unit == "rad"
         open_order = entry.kind == "quaternion" and not _lettered(group)
@@ -265,7 +262,7 @@ class Recognition:
 
     def _up(self) -> str:
         """Axes of the world, as the attitude has them."""
-        return self._made["quat_wb"][0].axes if "quat_wb" in self._made else ""
+        return self._entries["quat_wb"].axes if "quat_wb" in self._entries else ""
 
     def _body(self) -> str:
         """Axes of what is measured on board: an autopilot's, where its attitude has them."""
@@ -301,7 +298,8 @@ class Recognition:
         """Take the likeliest way to read the attitude; ask where no path says which one is."""
         best, *others = ranked
         rivals = [r for r in others if r.attitude is not best.attitude]
-        self._made["quat_wb"] = best.attitude.entry, best.attitude.channel
+        self._entries["quat_wb"] = best.attitude.entry
+        self._channels["quat_wb"] = best.attitude.channel
         if not rivals:
             return
         nats = rivals[0].doubt - best.doubt
@@ -390,30 +388,29 @@ class Recognition:
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
-            if name not in self._made:
+            if name not in self._entries:
                 continue
-            entry, channel = self._made[name]
-            slope = self._samples(self._group(name)).derivative(_SPAN)
+            slope = self._samples(self._sources[name]).derivative(_SPAN)
             best = self._best(slope, [g for g in self._open(3) if g.unit not in LENGTHS])
             in_world = best[0].correlation if best else 0.0
-            turned = name == "pos_w" and self._body_velocity(channel, in_world)
+            turned = name == "pos_w" and self._body_velocity(in_world)
             if turned or best is None:
                 continue
             relation, group = best
-            ratio = relation.scale / UNITS[entry.unit][1]
+            ratio = relation.scale / UNITS[self._entries[name].unit][1]
             unit, _ = nearest_unit(ratio, ("m/s", "cm/s", "mm/s"))
             why = f"the derivative of {name}, correlation {relation.correlation:.2f},"
             why += f" {relation.scale:.3g} of its unit a second"
             self._take(name.replace("pos", "vel"), group, unit, why, axes=self._up())
 
-    def _body_velocity(self, path: Channel, in_world: float) -> bool:
+    def _body_velocity(self, in_world: float) -> bool:
         """Take a velocity that is the path's in the body's axes rather than in the world's, where
         it goes together with the path by a correlation.
         """
-        if "quat_wb" not in self._made:
+        if "quat_wb" not in self._entries:
             return False
-        time, slope = path.samples().derivative(_SPAN)
-        attitude = self._made["quat_wb"][1].samples()
+        time, slope = self._channels["pos_w"].samples().derivative(_SPAN)
+        attitude = self._channels["quat_wb"].samples()
         turned = Samples(time, rotate_back(attitude.attitudes(time), slope))
         best = self._best(turned, self._hinting("velocity"))
         if best is None:
@@ -430,8 +427,8 @@ class Recognition:
 
     def _rates(self) -> None:
         derived = Samples(np.empty(0), np.empty((0, 3)))
-        if "quat_wb" in self._made:
-            derived = self._made["quat_wb"][1].samples().rates()
+        if "quat_wb" in self._entries:
+            derived = self._channels["quat_wb"].samples().rates()
         best = None
         for group in self._hinting("rate_b"):
             values = self._samples(group)
@@ -492,7 +489,7 @@ class Recognition:
                 for unit in fitting_units(group.middle, units, *_PACK):
                     why = f"a middle of {group.middle:.4g}: a pack in {unit}"
                     self._take("battery_voltage", group, unit, why)
-            elif group.matches("angle") and "quat_wb" not in self._made:
+            elif group.matches("angle") and "quat_wb" not in self._entries:
                 unit = _angle_unit(group)
                 why = f"an angle, by its name; a middle of {group.middle:.3g}"
                 if self._take("angle", group, unit, why) and not group.unit:
@@ -515,14 +512,15 @@ class Recognition:
                 self._take("thrust_command", group, unit, f"a middle of {group.middle:.4g}")
 
     def _ask_what_is_open(self) -> None:
-        if "quat_wb" in self._made and not self._made.keys() & {"pos_w", "rate_b"}:
-            group = self._group("quat_wb")
-            if self._made["quat_wb"][0].kind == "euler" and not group.unit:
+        known = self._entries.keys()
+        if "quat_wb" in known and not known & {"pos_w", "rate_b"}:
+            group = self._sources["quat_wb"]
+            if self._entries["quat_wb"].kind == "euler" and not group.unit:
                 self.questions.append(
                     f"are {group.listed} angles, as taken, or body rates? Nothing in the motion"
                     " says"
                 )
-        if "pos_w" in self._made and not self._made.keys() & _MOTIONS:
+        if "pos_w" in known and not known & _MOTIONS:
             self.questions.append(
                 "nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w"
             )
