@@ -47,11 +47,6 @@ class Manoeuvre:
         """[m/s], shape (N, 3)."""
         return np.gradient(self.pos_w, PERIOD, axis=0)
 
-    @cached_property
-    def acc_w(self) -> np.ndarray:
-        """[m/s^2], shape (N, 3)."""
-        return np.gradient(self.vel_w, PERIOD, axis=0)
-
     @property
     def lowest(self) -> float:
         """Return the height at which a flight is aborted [m]."""

@@ -301,14 +301,7 @@ def make_channel(
     spec = STANDARD_CHANNELS.get(entry.name)
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
     rows = forward_rows(time)
-    finite = np.isfinite(time)
-    steps = np.diff(time[finite])
-    notes = {
-        "rows": len(time),
-        "unstamped": int(np.sum(~finite)),
-        "repeated": int(np.sum(steps == 0.0)),
-        "backwards": int(np.sum(steps < 0.0)),
-    }
+    notes = _counts_of(time)
     blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
     notes["blank"] = int(np.sum(blank))
     time = time[rows[~blank]]
@@ -346,6 +339,18 @@ def _changed(values: np.ndarray) -> np.ndarray:
     """Tell the rows that differ from the row before, bool, shape (T,); the first one does."""
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
     return np.append(True, ~np.all(same, axis=1))
+
+
+def _counts_of(stamps: np.ndarray) -> dict[str, int]:
+    """Count rows, and those among them that keep a clock from going on."""
+    finite = np.isfinite(stamps)
+    steps = np.diff(stamps[finite])
+    return {
+        "rows": len(stamps),
+        "unstamped": int(np.sum(~finite)),
+        "repeated": int(np.sum(steps == 0.0)),
+        "backwards": int(np.sum(steps < 0.0)),
+    }
 
 
 def forward_rows(stamps: np.ndarray) -> np.ndarray:
