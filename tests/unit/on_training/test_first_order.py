@@ -25,9 +25,9 @@ SMALL = [
     "first_order.horizon=14",
     "first_order.initial_release=-0.3",
 ]
-LEAST_COSINE, MOST_BIAS = 0.99, 0.04
-"""Between slopes of surrogate and simulator, of all axes of a state: what the fit leaves (a sixth
-of a step's change of the rates) lets them differ by 0.991 and 0.035.
+LEAST_COSINE, MOST_BIAS = 0.98, 0.18
+"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
+rates) lets them differ by 0.985 and, of the yaw of an X500, 0.17.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
@@ -56,10 +56,11 @@ def decided(fo, obs):
 
 def backward(fo, by):
     """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop."""
-    for name, tensor in fo.flights.adjoint.items():
-        tensor.copy_(by[name]) if name in by else tensor.zero_()
+    for name, tensor in (fo.flights.adjoint | {"seen": fo.layers.by_seen}).items():
+        tensor.zero_()
+        if name in by:
+            tensor.view(-1, *by[name].shape)[-1] = by[name]
     fo.layers.by_action.zero_()
-    fo.layers.by_seen.zero_()
     fo.backward()
     return fo.layers.by_action.clone()
 
@@ -112,8 +113,8 @@ SLOWER = [
     ids=["own", "closed loop", "slower", "x500"],
 )
 def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
-    """Where a flight ends against commands at earlier steps, by differences of the simulator: of
-    planned commands alone, and of a policy that reacts.
+    """How a flight ends, and what is seen of that, against commands at earlier steps, by
+    differences of the simulator: of planned commands alone, and of a policy that reacts.
 
     Under rates of 10 and 4 rad/s the motors of an X500 saturate, and these fail."""
     fo = first_order(
@@ -122,6 +123,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
         *vehicle,
         "task.start.tether_variants=1",
         "first_order.decay=1.0",
+        "task.observation.latency=[0.01,0.01]",
         reaction=reaction,
     )
     torch.manual_seed(5)
@@ -136,30 +138,34 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
 
         monkeypatch.setattr(fo.layers, "forward", forward)
         fo.rollout()
-        return {name: x[-1].clone() for name, x in fo.flights.x.items()}
+        seen = fo.env.get_observations()["actor"].clone()
+        return {name: fo.flights.x[name][-1].clone() for name in STATES} | {"seen": seen}
 
-    fly(plan)
+    end = fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
     assert fo.layers.action.abs().max() < 1.0
     found = {}
-    for name in STATES:
-        for axis in range(fo.flights.x[name].shape[-1]):
-            by = torch.zeros_like(fo.flights.x[name])
-            by[-1, :, axis] = 1.0
+    for name, value in end.items():
+        for axis in range(value.shape[1]):
+            by = torch.zeros_like(value)
+            by[:, axis] = 1.0
             found[name, axis] = backward(fo, {name: by})
     size = 0.02  # normalised
-    pairs = {name: [] for name in STATES}
+    pairs = {key: [] for key in found}
     for k, channel in itertools.product((0, 4, 8, 11), range(4)):
         step = torch.zeros_like(plan)
         step[k, :, channel] = size
         above, below = fly(plan + step), fly(plan - step)
-        for (name, axis), slopes in found.items():
+        for name, axis in found:
             slope = (above[name] - below[name])[:, axis] / (2 * size)
-            pairs[name].append(torch.stack([slopes[k, :, channel], slope]))
-    for name, pair in pairs.items():
+            pairs[name, axis].append(torch.stack([found[name, axis][k, :, channel], slope]))
+    for key, pair in pairs.items():
         surrogate, simulator = torch.cat(pair, dim=1)
-        assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE, name
-        assert surrogate @ simulator / simulator.square().sum() == approx(1.0, abs=MOST_BIAS), name
+        if simulator.any():
+            size = surrogate.norm() * simulator.norm()
+            assert surrogate @ simulator / size > LEAST_COSINE, key
+            slope = surrogate @ simulator / simulator.square().sum()
+            assert slope == approx(1.0, abs=MOST_BIAS), key
 
 
 def test_derivatives_decay_with_each_step():
