@@ -1,8 +1,8 @@
-"""Lenses that the tests of the fisheye model share."""
+"""Lenses that the tests of the fisheye model share, and a camera of any lens."""
 
 from pytest import mark
 
-from camera.params import FisheyeParams
+from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)
@@ -12,3 +12,9 @@ NARROW = FisheyeParams(
 LENSES = mark.parametrize(
     "params", [EQUIDISTANT, BENT, NARROW], ids=["equidistant", "bent", "narrow"]
 )
+
+
+def camera_of(lens: FisheyeParams) -> CameraParams:
+    """Return a camera below and ahead of the vehicle's middle, with the paper's square and ball."""
+    mount = MountParams(position_b=(0.03, 0.0, -0.02))
+    return CameraParams(lens, mount, KeypointNoiseParams(), 0.25, 0.033)

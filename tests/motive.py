@@ -46,9 +46,9 @@ def frame(stamp: float, *bodies: tuple[int, tuple, tuple, bool]) -> bytes:
 class Motive:
     """Streams to whoever has said hello; ``client`` is its address."""
 
-    def __init__(self, host: str = "127.0.0.1") -> None:
+    def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind((host, 1510))
+        self._socket.bind(("127.0.0.1", 1510))
         self._socket.settimeout(0.1)
         self.client: tuple[str, int] | None = None
         self._closed = threading.Event()

@@ -100,14 +100,14 @@ class Sent(MavlinkSource):
 
     start = 0.0
 
-    def __init__(self, params: HilParams, stream: PoseStream, seed: int = 0) -> None:
+    def __init__(self, params: HilParams, stream: PoseStream) -> None:
         port, _ = pipe()
         super().__init__(
             Link(port, roster=Roster(parties(params, True, False))),
             params.source.senders,
             lambda: 0.0,
         )
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         self._datagrams = sorted(_datagrams(stream, rng), key=lambda row: row[0])
         self._next = 0
 

@@ -93,15 +93,16 @@ def scene_sim(
     plant = scene_plant(scene, substep, precision, control_period)
     plant = replace(plant, sim=replace(plant.sim, solver=solver))
     sim = HybridSim(plant, 1, direct=True, **options)
-    sim.place(
-        np.array([scene.pos_w]),
-        np.array([scene.quat_wb]),
-        np.array([scene.vel_w]),
-        np.array([scene.rate_b]),
-        scene.cable_dir_w()[None],
-        scene.cable_vel_w()[None],
-    )
+    place_scene(sim, scene)
     return sim
+
+
+def place_scene(sim: HybridSim, scene: Scene) -> None:
+    """Put a simulator's vehicle and rope where a scene starts."""
+    vehicle = (
+        np.array([value]) for value in (scene.pos_w, scene.quat_wb, scene.vel_w, scene.rate_b)
+    )
+    sim.place(*vehicle, scene.cable_dir_w()[None], scene.cable_vel_w()[None])
 
 
 @dataclass(frozen=True)

@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import warp as wp
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from pytest import mark
 
 from sim.hybrid import HybridSim
-from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
+from tests.contract.test_simulator_bits import assert_same, everything, start_spreads
 from tests.plants import paper_plant
 from tests.simulators import numerics, random_commands
-from visthrow import config
-from visthrow.task import TaskParams
 
 pytestmark = [
     mark.gpu,
@@ -26,10 +24,6 @@ thousands of those [m].
 """
 
 
-def everything(sim: HybridSim) -> dict[str, np.ndarray]:
-    return {name: sim.get(name) for name in (*STATE_FIELDS, *OUTPUT_FIELDS)}
-
-
 def driven(sim: HybridSim) -> dict[str, np.ndarray]:
     for k, command in enumerate(random_commands(0, STEPS, COUNT)):
         sim.set_command(command, (np.arange(COUNT) % 2) * (k == 5))
@@ -37,13 +31,8 @@ def driven(sim: HybridSim) -> dict[str, np.ndarray]:
     return everything(sim)
 
 
-def assert_same(a: dict, b: dict) -> None:
-    for name, value in a.items():
-        assert_array_equal(value, b[name], err_msg=name)
-
-
 def test_graph_equals_launches():
-    start = config.load(TaskParams, config.find("task", "state")).start
+    start = start_spreads()
     sims = [HybridSim(paper_plant(), COUNT, DEVICE, seed=1) for _ in range(2)]
     mask = wp.array((np.arange(COUNT) % 3 == 0).astype(np.int32), device=DEVICE)
     for sim in sims:

@@ -5,15 +5,13 @@ In every one the fake watches that no command arrives that is not finite or with
 the release comes once at most, from an armed vehicle inside its fence."""
 
 import errno
-import math
 import time
 
 from pytest import approx, mark
 
 from hil.control.recording.record import RunRecorder
-from hil.control.state_machine import OperatorInput
 from tests.fakes.fake_px4 import HOLD
-from tests.hil_flight import AT_ONCE, NEVER
+from tests.hil_flight import AT_ONCE, NEVER, AutoOperator
 from tests.level import LevelPlant
 from tests.loopback.wire import AUTOPILOTS, QUICK, cut, peers
 
@@ -23,16 +21,6 @@ START = 2.2
 TICK = 0.02
 BEAT = {"ardupilot": 1.0, "px4": 1.0, "betaflight": 0.1}
 """Between two signs of life of the autopilot [s]."""
-
-
-class OneWord:
-    """Arms whenever it is ready, and says abort from a time on [s]."""
-
-    def __init__(self, abort: float = math.inf):
-        self.abort, self.clock = abort, None
-
-    def words(self, state: str) -> OperatorInput:
-        return OperatorInput(arm=state == "ready", abort=self.clock.now() >= self.abort)
 
 
 def run(
@@ -53,8 +41,8 @@ def run(
         plant or LevelPlant(), kind=kind, loaded=loaded, overrides=(*QUICK, *overrides), **options
     )
     runner, source, clock, fake = made
-    operator = operator or OneWord()
-    operator.clock, told, tick = clock, [], runner.tick
+    operator = operator or AutoOperator()
+    told, tick = [], runner.tick
 
     def ticked(now, *args, **kwargs):
         if watch is not None:

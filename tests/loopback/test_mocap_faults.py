@@ -32,7 +32,7 @@ ENDS = {"stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quate
 FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double"}
 
 
-def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
+def spoiled(name: str):
     """A run in which a fault happens in mid throw: runner, fake, and the first decision of each
     state.
     """
@@ -41,16 +41,16 @@ def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
     runner, source, clock, fake = peers(
         plant,
         overrides=(*QUICK, *more),
-        loaded=loaded,
+        loaded=NEVER,
         mocap_fault=(name, START),
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
     )
-    cut(runner, source, clock, AutoOperator(), None, START + seconds, told.append)
+    cut(runner, source, clock, AutoOperator(), None, START + 0.7, told.append)
     return runner, fake, [(d.state, d.reason, d.time) for d in told]
 
 
-def when(told, state: str, after: float = 0.0) -> float:
-    return next(time for name, _, time in told if name == state and time > after)
+def when(told, state: str) -> float:
+    return next(time for name, _, time in told if name == state)
 
 
 @mark.parametrize("name", sorted(FAULTS))

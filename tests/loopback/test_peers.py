@@ -38,16 +38,10 @@ class Wire:
         )
         self.backend = make_backend(self.params, self.link)
 
-    def peer(self, system=1, component=1, number=None):
+    def peer(self, number=None):
         """Somebody with a socket of its own, and what it hears."""
-        link, heard = (
-            Link(
-                open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")),
-                system,
-                component,
-            ),
-            [],
-        )
+        port, heard = open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")), []
+        link = Link(port, 1, 1)
         link.listen(lambda message, arrival: heard.append(message.get_type()))
         return link, heard
 

@@ -94,11 +94,11 @@ def test_extension_is_the_reference_plants(name):
     assert np.abs(swing(plain) - here).max() > DISTINCT * AGREEMENT
 
 
-def let_go(plant, ask: int = 3):
+def let_go(plant):
     """When a swinging payload separated [s] and how fast it then was [m/s], by this simulator and
     the reference.
 
-    It is asked for after ``ask`` periods: the pull is known once a step was done.
+    It is asked for after three periods: the pull is known once a step was done.
     """
     tilt, still = (
         np.tile([np.sin(0.9), 0.0, -np.cos(0.9)], (1, plant.rope.segments, 1)),
@@ -114,9 +114,9 @@ def let_go(plant, ask: int = 3):
     there.reset(home, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, tilt)
     k = 0
     while not here.get("separated")[0]:
-        here.set_command(command, np.array([int(k >= ask)]))
+        here.set_command(command, np.array([int(k >= 3)]))
         here.step()
-        there.step(command, k >= ask)
+        there.step(command, k >= 3)
         k += 1
     opened = (
         0.02 * (k - 1) + float(here.get("separation_time")[0]),

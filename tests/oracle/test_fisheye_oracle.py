@@ -1,4 +1,4 @@
-"""Fisheye against OpenCV and kornia, which are right for z > 0 only."""
+"""Fisheye against OpenCV, which is right for z > 0 only."""
 
 import math
 
@@ -34,21 +34,6 @@ def test_equal_to_opencv_before_the_lens(params):
     ours, valid = Fisheye(params).project(torch.from_numpy(points))
     assert valid.all()
     assert np.abs(ours.numpy() - theirs[:, 0]).max() < PIXEL_TOLERANCE
-
-
-@LENSES
-def test_equal_to_kornia_before_the_lens(params):
-    from kornia.geometry.camera import distort_points_kannala_brandt
-
-    points = torch.from_numpy(points_before_the_lens())
-    values = torch.tensor(
-        [params.fx, params.fy, params.cx, params.cy, *params.coefficients], dtype=torch.float64
-    )
-    theirs = distort_points_kannala_brandt(
-        (points[:, :2] / points[:, 2:])[None], values[None, None]
-    )[0]
-    ours, _ = Fisheye(params).project(points)
-    assert (ours - theirs).abs().max() < PIXEL_TOLERANCE
 
 
 @LENSES

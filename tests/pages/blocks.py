@@ -168,7 +168,6 @@ class Runner:
         ] = {}  # digest of a command and its files -> copy of what it wrote
         self.printed: dict[str, str] = {}  # by the same digest
         self.last: list[str] = []  # digests of the block that ran last
-        self.seconds: dict[str, float] = {}  # place and command -> processor time [s]
 
     def run(self, blocks: list[Block]) -> None:
         """Run the blocks of one page in order.
@@ -222,12 +221,11 @@ class Runner:
             if digest in self.done:
                 shutil.copytree(self.done[digest], ".", dirs_exist_ok=True)
                 continue
-            before, start = _files(), _processor()
+            before = _files()
             if len(jobs) > 1:
                 _side_by_side(jobs, block.place)
             else:
                 self.printed[digest] = _one(jobs[0], block.place)
-            self.seconds[f"{block.place} {' '.join(jobs[0])}"] = _processor() - start
             self.done[digest] = kept = self.work / f"kept-{len(self.done)}"
             kept.mkdir()
             for path in sorted(_files() - before):
@@ -311,13 +309,6 @@ def _side_by_side(jobs: list[list[str]], place: str) -> None:
             process.kill()
             process.wait()
     assert not any(statuses), f"{place}: statuses {statuses}"
-
-
-def _processor() -> float:
-    """Processor time of this process and of those that ended [s]: what a block costs however busy
-    the machine is.
-    """
-    return sum(os.times()[:4])
 
 
 def _environment() -> dict[str, str]:

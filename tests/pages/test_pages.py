@@ -18,15 +18,7 @@ COMMENTS = r"<!--.*?-->"
 
 @fixture(scope="module")
 def runner(tmp_path_factory):
-    runner = Runner(tmp_path_factory.mktemp("pages"))
-    yield runner
-    print(
-        *(
-            f"{seconds:6.1f} s  {what}"
-            for what, seconds in sorted(runner.seconds.items(), key=lambda item: -item[1])
-        ),
-        sep="\n",
-    )
+    return Runner(tmp_path_factory.mktemp("pages"))
 
 
 @mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

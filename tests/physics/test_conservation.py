@@ -12,7 +12,7 @@ from sim.hybrid import HybridSim
 from sim.params import GRAVITY, LawParams
 from tests.plants import EVERYTHING, SCENES
 from tests.scenes import Wrench, load_scene
-from tests.simulators import energy, momentum, scene_plant, scene_sim
+from tests.simulators import energy, momentum, place_scene, scene_plant, scene_sim
 
 DRIFT = 5e-3
 """Of the energy in 1.2 s at 2 ms."""
@@ -113,21 +113,9 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
     rubbing = replace(plant.rope, mount_damping=FRICTION)
     law = LawParams("rope joint", (), "joint_rate", FRICTION)
     ends = []
-    for same in (
-        plant,
-        replace(plant, rope=rubbing),
-        replace(plant, laws=(law,)),
-    ):
+    for same in (plant, replace(plant, rope=rubbing), replace(plant, laws=(law,))):
         sim = HybridSim(same, 1, gravity=0.0, extensions=EVERYTHING)
-        place = (
-            [scene.pos_w],
-            [scene.quat_wb],
-            [scene.vel_w],
-            [scene.rate_b],
-            [scene.cable_dir_w()],
-            [scene.cable_vel_w()],
-        )
-        sim.place(*map(np.array, place))
+        place_scene(sim, scene)
         sim.set_command([[2.0, 0.0, 0.0, 0.0]])
         for _ in range(20):
             sim.step()

@@ -60,14 +60,12 @@ def test_hardly_a_failed_state_without_terminations():
     assert fallbacks < 0.01 * 100 * count
 
 
-def segment_rates(
-    substep: float, precision: str, count: int, seed: int, steps: int = 10
-) -> np.ndarray:
+def segment_rates(substep: float, precision: str, count: int, seed: int) -> np.ndarray:
     """Rates of all rods over the first 0.2 s [1/s], shape (T, E, L, 3)."""
     plant = replace(plant_of(experiment()), sim=numerics(substep, precision))
     extensions = EVERYTHING if precision == "float64" else frozenset()
     sim, rows = started(count, seed, plant, extensions), []
-    for command in random_commands(seed, steps, count):
+    for command in random_commands(seed, 10, count):
         sim.set_command(command)
         sim.step()
         assert not np.any(sim.get("status") & NONFINITE)

@@ -22,13 +22,11 @@ def short(plant, segments=2):
     return changed(plant, {"rope.segments": segments})
 
 
-def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0, segments=2):
-    reference = ReferencePlant(
-        short(plant or plain_plant(), segments), extras, seed, count, step=STEP
-    )
+def start(extras, plant=None, count=1, speed=0.0, seed=0):
+    reference = ReferencePlant(short(plant or plain_plant(), 2), extras, seed, count, step=STEP)
     velocity = np.tile([speed, 0.0, 0.0], (count, 1))
     reference.reset(
-        np.tile([0.0, 0.0, height], (count, 1)),
+        np.tile([0.0, 0.0, 1.5], (count, 1)),
         np.tile(LEVEL, (count, 1)),
         velocity,
         np.zeros((count, 3)),

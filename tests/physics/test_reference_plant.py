@@ -6,9 +6,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 from pytest import mark, raises
 
-from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
 from tests.plants import paper_plant, plain_plant
+from visthrow.common.free_fall import fall_time, free_flight
 
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 STILL = np.zeros((1, 3))
@@ -72,17 +72,13 @@ def test_landing_equals_the_closed_form_without_rope_mass(step):
     opened = reference.state
     assert not opened.attached[0]
     p, v = opened.payload_pos_w[0], opened.payload_vel_w[0]
-    time = (
-        v[2] + np.sqrt(v[2] ** 2 + 2 * GRAVITY * (p[2] - plant.release.landing_height))
-    ) / GRAVITY
+    time = fall_time(p[2] - plant.release.landing_height, v[2])
     for _ in range(int(time / 0.02) + 1):
         reference.step(command)
     landing = reference.landing
     assert landing.landed[0]
     assert abs(landing.time[0] - opened.time - time) < 1e-4
-    assert_allclose(
-        landing.point_w[0], (*(p + v * time)[:2], plant.release.landing_height), atol=3e-4
-    )
+    assert_allclose(landing.point_w[0], free_flight(p, v, time), atol=3e-4)
 
 
 def test_wrong_shapes_are_named():

@@ -9,6 +9,7 @@ from pytest import approx, mark
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, PlantParams
 from tests.plants import paper_plant
+from visthrow.common.free_fall import fall_time, free_flight
 from visthrow.cooperative.team_sim import TeamSim
 
 SECOND_ORDER = 1e-3
@@ -30,11 +31,11 @@ def plant(share: float = 0.075, segments: int = 5) -> PlantParams:
     return replace(base, rope=rope)
 
 
-def around(team: int, tilt: float = TILT) -> np.ndarray:
+def around(team: int) -> np.ndarray:
     """Directions from the mounts to the load, shape (1, V, 3)."""
     angle = 2.0 * np.pi * np.arange(team) / team
-    side = -np.sin(tilt)
-    down = np.full(team, -np.cos(tilt))
+    side = -np.sin(TILT)
+    down = np.full(team, -np.cos(TILT))
     return np.stack([side * np.cos(angle), side * np.sin(angle), down], -1)[None]
 
 
@@ -125,8 +126,6 @@ def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():
     assert gone[0] == approx(0.04 + params.release.lag, abs=1e-5)
     assert gone[1] == approx(0.04 + late.lag, abs=1e-5)
     pos, vel = (array.numpy()[0].astype(float) for array in sim.load)
-    height = params.release.landing_height
-    time = (vel[2] + np.sqrt(vel[2] ** 2 + 2.0 * GRAVITY * (pos[2] - height))) / GRAVITY
-    landing = pos + time * vel - [0.0, 0.0, 0.5 * GRAVITY * time**2]
+    landing = free_flight(pos, vel, fall_time(pos[2] - params.release.landing_height, vel[2]))
     assert_allclose(sim.get("landing_w")[1], landing, atol=1e-4)
     assert np.abs(sim.get("landing_w")[0] - landing).max() > 0.01

@@ -6,7 +6,6 @@ import signal
 from pytest import fixture
 
 from tests.commands import run_python
-from visthrow import cli
 from visthrow.training import trainer
 
 
@@ -21,29 +20,6 @@ def few_throws(monkeypatch):
     how many.
     """
     monkeypatch.setattr(trainer, "EVALUATED", 4)
-
-
-@fixture
-def signalled(monkeypatch):
-    """Function that runs a command's training of four iterations, sends a signal in the second, and
-    resumes it.
-    """
-
-    def run(algorithm, words, number):
-        learn = algorithm.learn
-
-        def interrupted(self, done):
-            figures = learn(self, done)
-            if done == 1 / 4:
-                os.kill(os.getpid(), number)
-            return figures
-
-        monkeypatch.setattr(algorithm, "learn", interrupted)
-        assert cli.main(words) == 130
-        monkeypatch.setattr(algorithm, "learn", learn)
-        assert cli.main([*words, "--resume"]) == 0
-
-    return run
 
 
 KILLED = """

@@ -1,8 +1,6 @@
-"""Distillation: it learns, its policy remembers on board as in training, and it goes on bit for bit
-after a stop.
+"""Distillation: it learns, and its policy remembers on board as in training. `test_ranks` resumes
+it.
 """
-
-import signal
 
 import numpy as np
 import torch
@@ -15,7 +13,6 @@ from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
-from visthrow.training.distillation import Distillation
 from visthrow.training.env import ThrowEnv
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -164,14 +161,6 @@ def test_the_pilot_remembers_as_training_does(whole):
             action = act(seen)
             np.testing.assert_allclose(out.action, action.clamp(-1.0, 1.0).numpy(), atol=AGREES)
             seen = env.carry(action)["actor"]
-
-
-def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled):
-    folder = tmp_path / "run"
-    signalled(Distillation, words(folder), signal.SIGTERM)
-    one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
-    for name, value in one.parts().items():
-        np.testing.assert_array_equal(value.numpy(), two.parts()[name].numpy(), err_msg=name)
 
 
 def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, refused):

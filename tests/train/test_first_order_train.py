@@ -1,19 +1,14 @@
-"""First-order training through the command: what it leaves behind, and that it goes on bit for bit
-however it was stopped.
-"""
-
-import signal
+"""First-order training through the command: what it leaves behind. `test_ranks` resumes it."""
 
 import numpy as np
 import torch
-from pytest import fixture, mark
+from pytest import mark
 
 from tests.commands import set_words
 from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training.first_order.first_order_training import FirstOrder
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = [
@@ -32,25 +27,9 @@ def words(folder, *extra):
     return [*command.split(), *set_words(SMALL), *extra]
 
 
-def same(one, two):
-    weights = [
-        [w.numpy() for w in Policy.load(folder / "policy.npz").weights] for folder in (one, two)
-    ]
-    for a, b in zip(*weights, strict=True):
-        np.testing.assert_array_equal(a, b)
-    return (two / "progress.csv").read_text().count("\n") == 1 + 4
-
-
-@fixture(scope="module")
-def whole(tmp_path_factory):
-    """A run of four iterations without interruption."""
-    torch.set_num_threads(1)
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    assert cli.main(words(folder)) == 0
-    return folder
-
-
-def test_its_policy_is_one_like_any_other(whole):
+def test_its_policy_is_one_like_any_other(tmp_path):
+    whole = tmp_path / "run"
+    assert cli.main(words(whole)) == 0
     experiment = config.load(Experiment, whole / "config.toml")
     policy = Policy.load(whole / "policy.npz")
     policy.require(contract_of(experiment))
@@ -61,12 +40,6 @@ def test_its_policy_is_one_like_any_other(whole):
         network = trainer.algorithm.average.module
         action = network.mlp(network.obs_normalizer(obs))
     assert (action - policy.act(obs)).abs().max() < 1e-6
-
-
-def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled):
-    folder = tmp_path / "run"
-    signalled(FirstOrder, words(folder), signal.SIGINT)
-    assert same(whole, folder)
 
 
 @mark.parametrize(

@@ -23,7 +23,8 @@ from camera.detectors.contours import (
 )
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
-from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+from camera.params import FisheyeParams
+from tests.lenses import camera_of
 from visthrow.detector_training.eyes import render_hall
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import posed_scenes
@@ -31,12 +32,7 @@ from visthrow.detector_training.scenes.scene import posed_scenes
 f64 = partial(torch.tensor, dtype=torch.float64)
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
-CAMERA = KeypointCamera(
-    CameraParams(
-        LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
-    ),
-    dtype=torch.float64,
-)
+CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)
 DETECTOR = Detector(CAMERA.fisheye, 0.033, 0.25)
 POS = f64([[0.1, 0.0, 1.3]])
 ROT = rotation_from_vector(f64([[0.05, 0.3, 0.1]]))

@@ -18,10 +18,10 @@ ANGLE_TOLERANCE = 1e-9  # rad; the bar of the model, 1e6 times the rounding of f
 EDGE_TOLERANCE = 1e-12  # rounding of a dozen float64 operations on values near 1
 
 
-def sphere(half_fov: float, rings: int = 60, spokes: int = 24) -> torch.Tensor:
+def sphere(half_fov: float) -> torch.Tensor:
     """Unit rays on a polar grid that holds the axis and the edge itself, float64, shape (N, 3)."""
-    theta = torch.linspace(0.0, half_fov, rings, dtype=torch.float64).repeat_interleave(spokes)
-    phi = torch.linspace(-math.pi, math.pi, spokes, dtype=torch.float64).repeat(rings)
+    theta = torch.linspace(0.0, half_fov, 60, dtype=torch.float64).repeat_interleave(24)
+    phi = torch.linspace(-math.pi, math.pi, 24, dtype=torch.float64).repeat(60)
     return torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], -1)
 
 

@@ -11,19 +11,15 @@ from pytest import raises
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.overlay import draw_overlay
-from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+from camera.params import FisheyeParams
 from camera.rectify import ViewParams, rectify, view_map
 from tests.boards import pixel_rays
+from tests.lenses import camera_of
 
 f64 = partial(torch.tensor, dtype=torch.float64)
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
-CAMERA = KeypointCamera(
-    CameraParams(
-        LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
-    ),
-    dtype=torch.float64,
-)
+CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)
 
 
 def throw_scene():

@@ -10,7 +10,8 @@ from pytest import fixture, importorskip, raises
 
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
-from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+from camera.params import FisheyeParams
+from tests.lenses import camera_of
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import posed_scenes, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import photographs, pyramid
@@ -18,9 +19,7 @@ from visthrow.detector_training.scenes.textures import photographs, pyramid
 importorskip("skimage", reason="photographs of visthrow[detector]")
 
 LENS = FisheyeParams(192, 192, 50.0, 50.0, 95.5, 95.5, k1=-0.01, fov_deg=200.0)
-CAMERA = CameraParams(
-    LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
-)
+CAMERA = camera_of(LENS)
 CENTRE = 0.2
 """Of an evenly lit ball some pixels large, by the middle of its pixels against its projection [px];
 the lens bends it a little.
@@ -32,14 +31,14 @@ def renderer():
     return Renderer(LENS, samples=8)
 
 
-def hovering(ball=(0.05, 0.1, 1.0), goal=(0.7, 0.3), tilt=(0.1, -0.2, 0.05)):
+def hovering(ball=(0.05, 0.1, 1.0)):
     """A plain scene, evenly lit, its ball without a seam."""
     scenes = posed_scenes(
         CAMERA,
         torch.tensor([[0.0, 0.0, 1.3]]),
-        rotation_from_vector(torch.tensor([tilt])),
+        rotation_from_vector(torch.tensor([[0.1, -0.2, 0.05]])),
         torch.tensor([ball]),
-        torch.tensor([goal]),
+        torch.tensor([[0.7, 0.3]]),
         torch.tensor([False]),
     )
     scenes.light[:, 3] = 1.0

@@ -11,6 +11,7 @@ from torch.testing import assert_close
 from sim.params import GRAVITY
 from visthrow import config
 from visthrow.common.errors import ConfigError
+from visthrow.common.free_fall import fall_time
 from visthrow.cooperative.team import TeamExperiment, as_flown, members
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.cooperative.team_training import TeamTraining, _summary
@@ -136,7 +137,7 @@ def test_three_vehicles_release_when_all_asked_and_land_after_the_last():
     last = {name: value[3].double() for name, value in env.last.items()}
     assert last["apart"] == approx(0.03, abs=1e-4)
     pos, vel, height = last["load_w"], last["load_vel_w"], env.cfg.release.landing_height
-    fall = (vel[2] + (vel[2].square() + 2.0 * GRAVITY * (pos[2] - height)).sqrt()) / GRAVITY
+    fall = fall_time(pos[2] - height, vel[2])
     assert_close(last["landing_w"][:2], (pos + fall * vel)[:2], atol=1e-4, rtol=0.0)
 
 

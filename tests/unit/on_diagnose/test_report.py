@@ -272,9 +272,9 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
-def texts_of(diagnosis, measured=None):
+def texts_of(diagnosis):
     """What a report's page says, as Markdown."""
-    return page.markdown_of("", "", report.sections(diagnosis, measured))
+    return page.markdown_of("", "", report.sections(diagnosis))
 
 
 def test_terms_that_act_together_are_printed_together(found):

@@ -290,9 +290,9 @@ def answer(lag):
     return lag + BENT * lag * np.maximum(-lag, 0.0)
 
 
-def world(seed: int, count: int = 12):
+def world(seed: int):
     """Statistics of flights about no lag, and the same flights simulated with another."""
-    rng, K = np.random.default_rng(seed), len(NAMES)
+    rng, K, count = np.random.default_rng(seed), len(NAMES), 12
     lags = rng.normal(size=count) * TRUTH / PRIORS.floor[0]
     seen = answer(lags) + rng.normal(size=count) / np.sqrt(INFORMATION)
     information = np.tile(np.eye(K), (count, 1, 1))

@@ -47,7 +47,7 @@ class Hall:
     mounted off and late.
     """
 
-    def __init__(self, runner: Runner, tilt_deg=TILT_DEG, latency: float = LATENCY) -> None:
+    def __init__(self, runner: Runner) -> None:
         experiment = load_policy(runner.params.policy).experiment
         self.runner, self.plant, self.rng = (
             runner,
@@ -55,8 +55,8 @@ class Hall:
             np.random.default_rng(3),
         )
         self.camera = KeypointCamera(runner.params.camera, dtype=torch.float64)
-        turn = rotation_from_vector(torch.deg2rad(torch.tensor(tilt_deg, dtype=torch.float64)))
-        self.rot_cb, self.late = (self.camera.rot_cb @ turn.T).numpy(), DELAY + latency
+        turn = rotation_from_vector(torch.deg2rad(torch.tensor(TILT_DEG, dtype=torch.float64)))
+        self.rot_cb, self.late = (self.camera.rot_cb @ turn.T).numpy(), DELAY + LATENCY
         self.goal = torch.tensor([runner.params.goal_w], dtype=torch.float64)
         self.path: deque = deque(maxlen=400)
         self.command = np.array([self.plant.mass[0] * 9.81, 0.0, 0.0, 0.0])

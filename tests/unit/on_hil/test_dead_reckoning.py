@@ -17,10 +17,10 @@ def estimate(time: float, age: float, rate=(0.0, 0.0, 0.0)) -> Estimate:
     return Estimate(time, vehicle, None, None, 0, 0, 0, AGE + age)
 
 
-def carried(ticks, rates, command, rate=(0.0, 0.0, 0.0)) -> DeadReckoning:
+def carried(ticks, rates, command) -> DeadReckoning:
     reckoning = DeadReckoning()
     for n in range(ticks + 1):
-        reckoning.update(estimate(n * TICK, n * TICK, rate), rates(n), command, MASS)
+        reckoning.update(estimate(n * TICK, n * TICK, (0.0, 0.0, 0.0)), rates(n), command, MASS)
     return reckoning
 
 

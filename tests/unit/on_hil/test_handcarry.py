@@ -61,8 +61,8 @@ def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
     return poses
 
 
-def made(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0) -> FrameParams:
-    return FrameParams(axes, body_axes, quaternion, yaw, (0.0, 0.0, 0.0))
+def made(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw") -> FrameParams:
+    return FrameParams(axes, body_axes, quaternion, 0.0, (0.0, 0.0, 0.0))
 
 
 @fixture(scope="module")

@@ -25,8 +25,8 @@ from tests.configs import load_run
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 
 
-def packed(message, system=1, component=1) -> bytes:
-    return message.pack(mav.MAVLink(None, system, component))
+def packed(message) -> bytes:
+    return message.pack(mav.MAVLink(None, 1, 1))
 
 
 def odometry(frame=20, child=12, vel=(1.0, 2.0, 3.0), q=(1.0, 0.0, 0.0, 0.0), rate=(0.1, 0.2, 0.3)):

@@ -144,13 +144,6 @@ def test_a_list_of_allowed_senders_holds_addresses(text):
         check_allowed((text,))
 
 
-def test_an_open_link_answers_whoever_sent_the_first_valid_message():
-    who = Roster()
-    assert who.admit(pose(), A, 0.0)
-    assert not who.admit(pose(), B, 0.0)
-    assert who.addresses(beat()) == (A,)
-
-
 def test_no_flood_fills_the_memory():
     who, said = roster()
     for i in range(20_000):

@@ -16,9 +16,9 @@ KEY = bytes(range(32))
 WORD = mav.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3)
 
 
-def pair(ours=KEY, theirs=KEY):
+def pair(theirs=KEY):
     here, there = pipe()
-    got, link, peer = [], Link(here, key=ours), Link(there, 1, 1, key=theirs)
+    got, link, peer = [], Link(here, key=KEY), Link(there, 1, 1, key=theirs)
     link.listen(lambda message, arrival: got.append(message.get_type()))
     return link, peer, got
 

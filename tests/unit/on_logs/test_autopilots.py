@@ -20,11 +20,11 @@ def swing(i):
     return math.sin(0.1 * i)
 
 
-def ulog(path, *, flags=(1, 1, 1, 1), eph=0.3, resets=0, topics=None, parameters=None, count=300):
+def ulog(path, *, flags=(1, 1, 1, 1), eph=0.3, resets=0, topics=None, parameters=None):
     """A flight of 15 s along x, with flags of the estimate from the middle on."""
     local, attitude = [], []
-    for i in range(count):
-        t, late = 1_000_000 + 50_000 * i, i >= count // 2
+    for i in range(300):
+        t, late = 1_000_000 + 50_000 * i, i >= 150
         good = flags if late else (1, 1, 1, 1)
         place = (swing(i), 0.0, -1.5, 2.0 * math.cos(0.1 * i), 0.0, 0.0)
         local.append((t, *place, eph if late else 0.3, *good, resets if late else 0))
@@ -37,10 +37,10 @@ def ulog(path, *, flags=(1, 1, 1, 1), eph=0.3, resets=0, topics=None, parameters
     return path
 
 
-def outputs(name, field, size, moving, count=300, first=0.5):
+def outputs(name, field, size, moving, first=0.5):
     """A topic of so many outputs of which some move."""
     rows = []
-    for i in range(count):
+    for i in range(300):
         values = [first + 0.1 * swing(i + k) if k in moving else 0.0 for k in range(size)]
         rows.append((1_000_000 + 50_000 * i, *values))
     return ["uint64_t timestamp", f"float[{size}] {field}"], rows
@@ -177,12 +177,12 @@ def test_rotor_speeds_of_escs_that_log_one_by_one(ardupilot):
     assert speeds == approx([6200, 6000, 6100, 6300])
 
 
-def write_tlog(path, more, count=200, local=True):
+def write_tlog(path, more, local=True):
     """A .tlog of a vehicle that booted 100 s before; ``more`` makes messages of encoder and row."""
     from pymavlink.dialects.v20 import ardupilotmega as dialect
 
     mav, out = dialect.MAVLink(None, 1, 1), []
-    for i in range(count):
+    for i in range(200):
         s = 0.02 * i
         messages = [
             mav.heartbeat_encode(2, 3, 128, 0, 4),

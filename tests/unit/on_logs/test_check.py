@@ -231,7 +231,7 @@ def test_a_pose_stream_of_another_clock_is_told():
     assert row.figures["delay_s"] == approx(0.035, abs=0.002)
 
 
-def carrying(share: float = 0.2, length: float = 0.5) -> dict[str, np.ndarray]:
+def carrying() -> dict[str, np.ndarray]:
     """Columns of a vehicle that carries a payload along a smooth path, on a cable without mass."""
     time = np.arange(0.0, 10.0, 0.01)
     below = 0.5 * np.sin(np.outer(time, [1.9, 2.3, 1.1]) + [0.0, 1.0, 2.0]) + [0, 0, 2]
@@ -240,8 +240,8 @@ def carrying(share: float = 0.2, length: float = 0.5) -> dict[str, np.ndarray]:
         return np.gradient(np.gradient(path, time, axis=0), time, axis=0) + [0, 0, G]
 
     hung = pull(below)
-    above = below + length * hung / norm(hung, axis=1, keepdims=True)
-    thrust = (1.0 - share) * pull(above) + share * hung
+    above = below + 0.5 * hung / norm(hung, axis=1, keepdims=True)
+    thrust = 0.8 * pull(above) + 0.2 * hung
     up = thrust / norm(thrust, axis=1, keepdims=True)
     turn = upright(up, [1.0, 0.0, 0.0])
     rng = default_rng(3)

@@ -20,14 +20,12 @@ TIME = 0.01 * np.arange(400)
 YAW = 0.3
 
 
-def motion(time=TIME, phase=0.0):
+def motion(time=TIME):
     """Position [m], z up, and attitude of a vehicle whose lean makes its acceleration."""
-    pos = np.column_stack(
-        [np.sin(1.2 * time + phase), 0.5 * np.cos(1.7 * time), 1.5 + 0.1 * np.sin(time)]
-    )
+    pos = np.column_stack([np.sin(1.2 * time), 0.5 * np.cos(1.7 * time), 1.5 + 0.1 * np.sin(time)])
     acc = np.column_stack(
         [
-            -(1.2**2) * np.sin(1.2 * time + phase),
+            -(1.2**2) * np.sin(1.2 * time),
             -0.5 * 1.7**2 * np.cos(1.7 * time),
             9.81 - 0.1 * np.sin(time),
         ]

@@ -36,14 +36,14 @@ pytestmark = mark.filterwarnings("error::RuntimeWarning")
 
 
 @contextmanager
-def patience(seconds: float = PATIENCE) -> Iterator[None]:
+def patience() -> Iterator[None]:
     """Raise TimeoutError where a reader goes round in circles."""
 
     def late(*_: object) -> None:
-        raise TimeoutError(f"no end after {seconds:g} s")
+        raise TimeoutError(f"no end after {PATIENCE:g} s")
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
     try:
         yield
     finally:

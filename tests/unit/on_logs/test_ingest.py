@@ -79,30 +79,31 @@ class TestCodec:
         assert self.decode(blackbox_codec.TAG8_8SVB, nine, 9) == [0] * 7 + [7, 8]
 
     @mark.parametrize(
-        ("data", "values"),
+        ("code", "data", "values"),
         [
-            (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
-            (packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
-            (packed("10" + bits(31, 6) + "00" + bits(-32, 6) + "00" + bits(-1, 6)), [31, -32, -1]),
+            ("3S32", packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            ("3S32", packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
             (
+                "3S32",
+                packed("10" + bits(31, 6) + "00" + bits(-32, 6) + "00" + bits(-1, 6)),
+                [31, -32, -1],
+            ),
+            (
+                "3S32",
                 bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)),
                 [-5, -300, -(2**31)],
             ),
+            ("3SVARIABLE", packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            ("3SVARIABLE", packed("01" + bits(15, 5) + bits(-16, 5) + bits(-8, 4)), [15, -16, -8]),
+            (
+                "3SVARIABLE",
+                packed("10" + bits(-128, 8) + bits(63, 7) + bits(-64, 7)),
+                [-128, 63, -64],
+            ),
         ],
     )
-    def test_three_fields_with_a_selector(self, data, values):
-        assert self.decode(blackbox_codec.TAG2_3S32, data, 3) == values
-
-    @mark.parametrize(
-        ("data", "values"),
-        [
-            (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
-            (packed("01" + bits(15, 5) + bits(-16, 5) + bits(-8, 4)), [15, -16, -8]),
-            (packed("10" + bits(-128, 8) + bits(63, 7) + bits(-64, 7)), [-128, 63, -64]),
-        ],
-    )
-    def test_three_fields_of_uneven_width(self, data, values):
-        assert self.decode(blackbox_codec.TAG2_3SVARIABLE, data, 3) == values
+    def test_three_fields_with_a_selector(self, code, data, values):
+        assert self.decode(getattr(blackbox_codec, f"TAG2_{code}"), data, 3) == values
 
     def test_four_fields_of_nibbles(self):
         chance, widths = random.Random(3), (0, 4, 8, 16)

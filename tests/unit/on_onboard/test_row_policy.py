@@ -30,22 +30,22 @@ def network(activation="elu", widths=(WIDTH, 16, 12, 5), **further):
     return Policy(tuple(weights), tuple(biases), activation, {}, **further)
 
 
-def estimator(kept=7, hidden=8, memory=6):
+def estimator():
     """An estimator with two layers before its memory, the last of whose estimates keeps nothing."""
     draw = torch.randn
     return Estimator(
         mean=draw(WIDTH),
         std=0.5 + torch.rand(WIDTH),
-        encoder_weight=0.3 * draw(hidden, WIDTH),
-        encoder_bias=draw(hidden),
-        input_weight=0.5 * draw(3 * memory, hidden + 1),
-        input_bias=draw(3 * memory),
-        memory_weight=0.5 * draw(3 * memory, memory),
-        memory_bias=draw(3 * memory),
-        output_weight=0.3 * draw(kept, memory),
-        output_bias=draw(kept),
-        kept=torch.tensor([*range(2, 1 + kept), WIDTH]),
-        inner=((0.3 * draw(hidden + 1, hidden), draw(hidden + 1)),),
+        encoder_weight=0.3 * draw(8, WIDTH),
+        encoder_bias=draw(8),
+        input_weight=0.5 * draw(18, 9),
+        input_bias=draw(18),
+        memory_weight=0.5 * draw(18, 6),
+        memory_bias=draw(18),
+        output_weight=0.3 * draw(7, 6),
+        output_bias=draw(7),
+        kept=torch.tensor([*range(2, 8), WIDTH]),
+        inner=((0.3 * draw(9, 8), draw(9)),),
     )
 
 

@@ -13,7 +13,7 @@ SEEN = ("goal", "payload", "validity")
 STEPS = 12
 
 
-def observations(name, seed, drop=0.3):
+def observations(name, seed):
     """Observations of a throw whose vehicle and actions are the same for all seeds, and whose
     keypoints, validity bits, goal and payload are not; with these bits of the last step.
     """
@@ -21,7 +21,7 @@ def observations(name, seed, drop=0.3):
     pilot, rng = Pilot(loaded.policy, loaded.experiment.camera), np.random.default_rng(seed)
     shown = []
     for step in range(STEPS):
-        points, valid = rng.uniform(-0.3, 0.3, (1, 8, 2)), rng.random((1, 8)) > drop
+        points, valid = rng.uniform(-0.3, 0.3, (1, 8, 2)), rng.random((1, 8)) > 0.3
         pilot._previous = np.full((1, 5), 0.01 * step, dtype=np.float32)
         out = pilot.act(
             np.array([[0.02 * step, 0.0, 1.3]]),

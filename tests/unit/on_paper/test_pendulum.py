@@ -4,6 +4,7 @@ import numpy as np
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from pytest import approx
+from scipy.spatial.transform import Rotation
 
 from sim.params import GRAVITY
 from tests.plants import paper_plant
@@ -31,12 +32,6 @@ def random_states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def roll(state, control, seconds, step=0.002):
-    for _ in range(round(seconds / step)):
-        state = pm.step(MODEL, state, control, step)
-    return state
-
-
 def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position [m] and velocity [m/s] of the vehicle, shape (..., 3) each."""
     direction, rate = state[..., DIR], state[..., RATE]
@@ -58,7 +53,9 @@ def energy(model: Pendulum, state: np.ndarray) -> np.ndarray:
 def test_without_thrust_energy_and_momentum_are_kept():
     state, control = random_states(20)
     control[:, 0] = 0.0
-    later = roll(state, control, 1.0)
+    later = state
+    for _ in range(500):
+        later = pm.step(MODEL, later, control, 0.002)
     assert np.allclose(energy(MODEL, later), energy(MODEL, state), rtol=RK4)
     both = []
     for now in (state, later):
@@ -80,10 +77,7 @@ def test_newton_holds_for_each_body_with_the_tension_between_them():
     acc = (ends[0][:, VEL] - ends[1][:, VEL]) / (2 * h)
     assert np.allclose(0.06 * acc, -pull - [0, 0, 0.06 * 9.81], atol=1e-4)
     acc = (vehicle(MODEL, ends[0])[1] - vehicle(MODEL, ends[1])[1]) / (2 * h)
-    x, y, z, w = state[:, QUAT].T
-    axis = np.column_stack(
-        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]
-    )
+    axis = Rotation.from_quat(state[:, QUAT]).apply([0.0, 0.0, 1.0])
     assert np.allclose(0.21 * acc, control[:, :1] * axis + pull - [0, 0, 0.21 * 9.81], atol=1e-3)
 
 

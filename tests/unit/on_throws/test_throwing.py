@@ -52,18 +52,16 @@ def dropping_policy(name: str = "state", release: float = 1.0, overrides=()) -> 
     return Policy((torch.zeros(5, width),), (bias,), "relu", contract, made_by)
 
 
-@fixture
-def dropper(tmp_path):
-    path = tmp_path / "dropper.npz"
+@fixture(scope="module")
+def dropper(tmp_path_factory):
+    path = tmp_path_factory.mktemp("policies") / "dropper.npz"
     dropping_policy().save(path)
     return path
 
 
 @fixture(scope="module")
-def flown(tmp_path_factory) -> FlightLog:
-    path = tmp_path_factory.mktemp("policies") / "dropper.npz"
-    dropping_policy().save(path)
-    return fly(load_policy(path), [0.5, 0.1, 0.0])
+def flown(dropper) -> FlightLog:
+    return fly(load_policy(dropper), [0.5, 0.1, 0.0])
 
 
 def test_loose_rope_keeps_its_links_and_its_energy():

@@ -4,7 +4,6 @@ reward of a crash worked by hand.
 
 import math
 
-import numpy as np
 import torch
 from pytest import approx
 from torch.testing import assert_close
@@ -120,19 +119,17 @@ def test_a_crash_costs_its_penalty_once():
 def test_a_step_while_carrying_is_rewarded_as_worked_by_hand():
     env = env_of("task.noise.command_step=0.0", "task.noise.command_bias=0.0", count=16)
     p, period = env.cfg.task.reward, env.cfg.sim.control_period
-    previous = env.previous_action.clone().double().numpy()
-    action = env.previous_action.clone()
+    previous, action = env.previous_action.clone(), env.previous_action.clone()
     action[:, 1:4] = torch.tensor([0.3, -0.2, 0.1])
     _, reward, done, _ = env.step(action)
     assert not done.any()
     state, out = env.views.state, env.views.out
-    vel, rate = state["vel_w"].double().numpy(), state["rate_b"].double().numpy()
-    payload_vel, u = out["payload_vel_w"].double().numpy(), action.double().numpy()
-    expected = p.velocity * np.sum(vel**2, 1) + p.angular_velocity * np.sum(rate**2, 1)
-    expected += p.relative_velocity * np.sum((payload_vel - vel) ** 2, 1)
-    expected -= p.smoothness * np.sum(np.array(p.rate_command) * u[:, 1:4] ** 2, 1)
-    du = u[:, :4] - previous[:, :4]
-    weights = np.array(p.command_change)
-    expected -= p.smoothness * np.sum(weights * (p.l1_mix * np.abs(du) + du**2), 1)
+    vel, change = state["vel_w"], (action - previous)[:, :4]
+    expected = p.velocity * vel.square().sum(1)
+    expected += p.angular_velocity * state["rate_b"].square().sum(1)
+    expected += p.relative_velocity * (out["payload_vel_w"] - vel).square().sum(1)
+    costs = torch.tensor(p.rate_command), torch.tensor(p.command_change)
+    expected -= p.smoothness * action[:, 1:4].square() @ costs[0]
+    expected -= p.smoothness * (p.l1_mix * change.abs() + change.square()) @ costs[1]
     expected -= p.carry_time * period
-    np.testing.assert_allclose(reward.numpy(), p.scale * expected, rtol=1e-4)
+    assert_close(reward, p.scale * expected, rtol=1e-4, atol=0.0)

@@ -25,9 +25,9 @@ SMALL = [
     "first_order.horizon=14",
     "first_order.initial_release=-0.3",
 ]
-LEAST_COSINE, MOST_BIAS = 0.98, 0.18
+LEAST_COSINE = 0.98
 """Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
-rates) lets them differ by 0.985 and, of the yaw of an X500, 0.17.
+rates) lets them differ by 0.985.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
@@ -108,11 +108,16 @@ SLOWER = [
 
 
 @mark.parametrize(
-    ("vehicle", "reaction"),
-    [([], 0.0), ([], 2.0), (SLOWER, 0.0), (["vehicle=vehicle/x500.toml"], 0.0)],
+    ("vehicle", "reaction", "bias"),
+    [
+        ([], 0.0, 0.06),
+        ([], 2.0, 0.18),
+        (SLOWER, 0.0, 0.06),
+        (["vehicle=vehicle/x500.toml"], 0.0, 0.18),
+    ],
     ids=["own", "closed loop", "slower", "x500"],
 )
-def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
+def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, monkeypatch):
     """How a flight ends, and what is seen of that, against commands at earlier steps, by
     differences of the simulator: of planned commands alone, and of a policy that reacts.
 
@@ -165,7 +170,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
             size = surrogate.norm() * simulator.norm()
             assert surrogate @ simulator / size > LEAST_COSINE, key
             slope = surrogate @ simulator / simulator.square().sum()
-            assert slope == approx(1.0, abs=MOST_BIAS), key
+            assert slope == approx(1.0, abs=bias), key
 
 
 def test_derivatives_decay_with_each_step():
