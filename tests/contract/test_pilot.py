@@ -19,9 +19,6 @@ from visthrow.training.env import ThrowEnv
 
 STEPS = 120
 
-NETWORK = 1e-5
-"""One row reads the weights in another order than a batch; the memory carries the difference on."""
-
 ROW = 1e-6
 """The pilot projects keypoints in float64, the environment in float32."""
 
@@ -74,12 +71,11 @@ def test_observation_and_command_equal_the_environments(name):
     assert released > 0, "some must end by a release"
 
 
-def test_one_row_decides_as_the_batch_and_a_rehearsal_changes_nothing():
+def test_a_rehearsal_changes_nothing():
     """The shipped policy has a memory: a rehearsal must not move it."""
     policy = load_policy("vision").policy
     camera = load_experiment("vision").camera
     rehearsed, plain = Pilot(policy, camera), Pilot(policy, camera)
-    batch = policy.actor(1)
     rng = np.random.default_rng(4)
     for _ in range(30):
         views = [rng.normal(0.0, 0.3, (1, 3)) for _ in range(5)]
@@ -90,8 +86,6 @@ def test_one_row_decides_as_the_batch_and_a_rehearsal_changes_nothing():
         ours, other = rehearsed.act(*shown), plain.act(*shown)
         for name in ("action", "command", "observation"):
             assert_array_equal(getattr(ours, name), getattr(other, name))
-        wanted = batch(torch.from_numpy(ours.observation)).clamp(-1.0, 1.0)
-        assert_allclose(ours.action, wanted.numpy(), rtol=0.0, atol=NETWORK)
 
 
 def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):

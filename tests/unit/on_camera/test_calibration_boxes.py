@@ -2,6 +2,7 @@
 
 import math
 
+import cv2
 import numpy as np
 import torch
 from pytest import approx, mark, raises
@@ -42,22 +43,20 @@ def kb(k1, k2, k3, k4):
     return polynomial(0, 1, 0, k1, 0, k2, 0, k3, 0, k4)
 
 
-def brown(mx, my, k1=0, k2=0, p1=0, p2=0, k3=0, k4=0, k5=0, k6=0, f=(FX, FY)):
-    """OpenCV's documentation of calib3d."""
-    r2 = mx**2 + my**2
-    radial = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    u = mx * radial + 2 * p1 * mx * my + p2 * (r2 + 2 * mx**2)
-    v = my * radial + p1 * (r2 + 2 * my**2) + 2 * p2 * mx * my
-    return CX + f[0] * u, CY + f[1] * v
+def brown(mx, my, k, f):
+    """OpenCV's own."""
+    matrix = np.array([[f[0], 0.0, CX], [0.0, f[1], CY], [0.0, 0.0, 1.0]])
+    ray, still = np.array([[mx, my, 1.0]]), np.zeros(3)
+    return cv2.projectPoints(ray, still, still, matrix, np.array(k, dtype=float))[0][0, 0]
 
 
 def pinhole(*k, f=(FX, FY)):
-    return lambda x, y, z: brown(x / z, y / z, *k, f=f)
+    return lambda x, y, z: brown(x / z, y / z, k, f)
 
 
 def omni(xi, *k, f):
     """Mei and Rives 2007."""
-    return lambda x, y, z: brown(x / (z + xi), y / (z + xi), *k, f=f)
+    return lambda x, y, z: brown(x / (z + xi), y / (z + xi), k, f)
 
 
 def ds(xi, alpha, f):

@@ -149,16 +149,23 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert len(set(formulas)) == len(formulas)
 
 
-class PassedBy(SyntheticModel):
-    """Flights below another vehicle, which pushes down for a moment: no law of the state."""
+class Pushed(SyntheticModel):
+    """A vehicle that something pushes along the vertical."""
 
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
         force = np.zeros((2, 3, len(motion["time"])))
-        moment, width = self._rng.uniform(0.0, 1.0), self._rng.uniform(0.1, 0.3)
-        size = self.law_size * self._rng.uniform(0.3, 1.0)
-        since = motion["time"] - motion["time"][0] - moment
-        force[0, 2] = -size * np.exp(-0.5 * (since / width) ** 2)
+        force[0, 2] = self.law_size * self._push(motion)
         return force.ravel()
+
+
+class PassedBy(Pushed):
+    """Flights below another vehicle, which pushes down for a moment: no law of the state."""
+
+    def _push(self, motion):
+        moment, width = self._rng.uniform(0.0, 1.0), self._rng.uniform(0.1, 0.3)
+        size = self._rng.uniform(0.3, 1.0)
+        since = motion["time"] - motion["time"][0] - moment
+        return -size * np.exp(-0.5 * (since / width) ** 2)
 
 
 def test_a_law_that_other_flights_do_not_repeat_is_not_told():
@@ -204,22 +211,18 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
     assert not diagnosis.named
 
 
-class Sinking(SyntheticModel):
-    """A push on the vehicle wherever it sinks faster than 0.3 m/s: no product of factors."""
+class Sinking(Pushed):
+    """A push wherever the vehicle sinks faster than 0.3 m/s: no product of factors."""
 
-    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
-        force = np.zeros((2, 3, len(motion["time"])))
-        force[0, 2] = self.law_size * (motion["vel_w"][:, 2] < -0.3)
-        return force.ravel()
+    def _push(self, motion):
+        return motion["vel_w"][:, 2] < -0.3
 
 
-class LinearDrag(SyntheticModel):
-    """Drag along the vertical of the same motion."""
+class LinearDrag(Pushed):
+    """Drag of the same motion."""
 
-    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
-        force = np.zeros((2, 3, len(motion["time"])))
-        force[0, 2] = -self.law_size * motion["vel_w"][:, 2]
-        return force.ravel()
+    def _push(self, motion):
+        return -motion["vel_w"][:, 2]
 
 
 @mark.parametrize(("kind", "size"), [(Sinking, 0.1), (LinearDrag, 0.05)])
