@@ -226,7 +226,7 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
         proposal.questions.append(
             f"{thrust} carries {carried:.3g} kg in {entry.unit}, and the vehicle weighs"
             f" {weighed:g} kg: no unit explains that; is it of one motor, of another vehicle, or a"
-            " share of the full thrust (channel throttle)?"
+            " share of the full thrust?"
         )
         return
     proposal.why[entry.name] += f"; {unit} by the mass: it carries {masses[unit]:.4g} kg"

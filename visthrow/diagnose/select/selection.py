@@ -243,11 +243,13 @@ class Selector:
                 move = chosen ^ present
                 parts = (nats for part, nats in shortfalls.items() if part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
-        ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
+        ranked = sorted(expected, key=expected.get, reverse=True)
+        alike = [s for s in ranked[3 * SIDE_BY_SIDE :] if self._limit(s) > STRONG]
+        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         close = []
-        for s in ranked:
-            margin = WINDOW if len(tried) < SIDE_BY_SIDE else self._limit(s)
-            if expected[s] > max(minimum, -min(margin, self._doubt(s))):
+        for s in ranked[: 3 * SIDE_BY_SIDE] + alike:
+            reach = max(min(margin, self._doubt(s)), self._limit(s))
+            if expected[s] > max(minimum, -reach):
                 close.append(s)
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
