@@ -10,6 +10,7 @@ from hil.check import AutopilotCheck
 from hil.control.loop import Loop
 from hil.control.state_machine import OperatorInput
 from hil.links.backends.ardupilot import BRAKE
+from hil.links.backends.autopilot import MOST_TEXTS
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.links.backends.betaflight import OPEN_TIME, STICKS
 from hil.links.pymav import mav
@@ -65,6 +66,18 @@ class Desk:
                 return self
             self.turn(0.02, HOVER, FOLLOW)
         raise AssertionError(self.status)
+
+
+def test_of_an_autopilot_that_says_much_the_newest_words_are_kept():
+    """The newest word is the reason why it is not armed."""
+    desk = Desk("ardupilot")
+    desk.turn(0.5)
+    for n in range(MOST_TEXTS + 1):
+        text = f"word {n}".encode()
+        desk.fake.link.send(mav.MAVLink_statustext_message(mav.MAV_SEVERITY_INFO, text))
+    desk.turn(0.5)
+    assert len(desk.backend.texts) == MOST_TEXTS
+    assert desk.backend.texts[-1] == f"word {MOST_TEXTS}"
 
 
 @mark.parametrize("kind", AUTOPILOTS)

@@ -192,8 +192,8 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._arm_refused = f"arming refused with result {result}: {self._last_text()}"
 
     def _hear_text(self, message: Any, arrival: float) -> None:
-        if len(self.texts) < MOST_TEXTS:
-            self.texts.append(str(message.text))
+        self.texts.append(str(message.text))
+        del self.texts[:-MOST_TEXTS]
 
     def _hear_outputs(self, message: Any, arrival: float) -> None:
         value = getattr(message, self._servo, 0) if self.params.servo_output else 0
