@@ -19,7 +19,7 @@ from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.held_out import effective_number
+from visthrow.diagnose.select.held_out import count_telling
 from visthrow.diagnose.select.result import Diagnosis
 
 DECISIVE = 11.0
@@ -119,7 +119,8 @@ class PlanningGoal:
         # a name counts as confirmed once so many flights bear on it
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
         flown = np.tile(new[self.vague, self.vague], (count, 1))
-        confirmed = effective_number(np.vstack((at_hand, flown))) >= FEWEST
+        promised = 0.5 * np.vstack((at_hand, flown)) * self.priors.slab[self.vague] ** 2
+        confirmed = count_telling(promised) >= FEWEST
         return [(j,) for j in np.compress(unknown & known & confirmed, self.vague).tolist()]
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:

@@ -139,13 +139,13 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     return Crossed(groups, left_out, statistics, folds, trained, shares)
 
 
-def effective_number(weights: ndarray) -> ndarray:
-    """Return how many equal flights are worth as much as these, to the nearest whole number.
+def count_telling(promised: ndarray) -> ndarray:
+    """Return the number of flights that can tell: their promise is strong, or no less than the
+    mean flight's.
 
-    ``weights``: information of each flight, not negative, shape (F, ...); the result has shape
-    (...). Source: Kish 1965, Survey Sampling, the effective size of a weighted sample."""
-    squares = np.maximum((weights**2).sum(0), np.finfo(float).tiny)
-    return np.rint(weights.sum(0) ** 2 / squares)
+    ``promised``: nats that a name promises on each flight, shape (F, ...); the result has shape
+    (...)."""
+    return (promised >= np.minimum(STRONG, promised.mean(0))).sum(0)
 
 
 def borne_out(
@@ -156,8 +156,8 @@ def borne_out(
 
     A right size promises theta' I theta / 2 nats with a variance of twice that. It brings more, and
     the part exceeds 1, where unnamed effects below their floors push the same way. The interval is
-    that of the flights' scatter (Student, over their effective number), or of this chance where it
-    is wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
+    that of the flights' scatter (Student, over those that can tell), or of this chance where it is
+    wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
     sizes that all flights gave, shape (K,)."""
     information = statistics.information
     promised = 0.5 * np.einsum("i,fij,j->f", theta, information, theta)
@@ -167,7 +167,7 @@ def borne_out(
     if total <= 0.0:
         return 0.0, np.nan, np.nan
     value = float(brought.sum() / total)
-    n = effective_number(promised)
+    n = count_telling(promised)
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
