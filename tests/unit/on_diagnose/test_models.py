@@ -35,6 +35,8 @@ from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.reporting.diagnosis_report import summary
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import diagnose_flights, result
+from visthrow.diagnose.select.point import Problem, linearise
+from visthrow.diagnose.select.selection import Selector
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -291,6 +293,20 @@ class TestFlyer:
         assert found["wind_x"].verdict == found["frame_tilt_y"].verdict == result.CLASS
         assert found["wind_x"].estimate == approx(4.0, rel=0.1)
         assert "frame_tilt_y" in found["wind_x"].partners
+
+    def test_another_of_a_group_is_simulated_however_little_it_promises(self, monkeypatch):
+        model = self.in_wind(monkeypatch, 0.3, drag=0.01, wind=4.0, noise=2e-3)
+        windows = model.windows({})
+        problem = Problem.of(model, windows, range(len(windows)))
+        selector = Selector(linearise(problem, np.zeros(len(model.effects))), 5.0, laws=False)
+        named = {c.name: c for c in selector.candidates}
+        wind, tilt, gain = (
+            frozenset({named[n]}) for n in ("wind_x", "frame_tilt_y", "thrust_gain")
+        )
+        selector.best = selector._tried(selector.nominal, [wind])[0]
+        listed = {tilt: -9.0, gain: -9.0}
+        tried = {gain | {c}: -1.0 for c in selector.candidates[:4]}
+        assert selector._short(listed, tried, -np.inf) == [tilt]
 
     def test_a_flight_whose_thrust_differs_says_what_and_by_how_much(self):
         logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]
