@@ -108,10 +108,11 @@ class Flipped(Model):
         self.model = model
         self.effects = model.effects
         self.channels = model.channels
-        flights = sorted({w.flight for w in model.windows({})})
+        windows = model.windows({})
+        flights = sorted({w.flight for w in windows})
         signs = np.resize([1.0, -1.0], len(flights))
         self._sign = dict(zip(flights, np.random.default_rng(seed).permutation(signs)))
-        self._base = model.residuals({})
+        self._base = [w.residual for w in windows]
 
     def _shift(self, window, base: np.ndarray) -> np.ndarray:
         return (self._sign[window.flight] - 1.0) * base
@@ -124,7 +125,7 @@ class Flipped(Model):
             for w, b in zip(self._last, self._base)
         ]
 
-    def residuals(self, theta, about=None):
+    def residuals(self, theta, about):
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         return [
             r + self._shift(w, b)

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import correlated_of, gram_of
@@ -27,8 +29,8 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     squares = []
     for windows, grams in zip(told, raw):
         shaped = correlated_of(grams, windows, noise.correlation_time)
-        shares = integrals(shaped, noise).shares(shaped)
-        squares.append(sum(share.square for share in shares))
+        statistics = integrals(shaped, noise).statistics(shaped, np.zeros(len(priors.floor)))
+        squares.append(statistics.square.sum())
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(
         len(w.residual) for w in told[-1]
     )

@@ -216,7 +216,7 @@ def test_several_forms_at_once_are_another_form(monkeypatch):
     forms = tuple(replace(form, name=f"effect_{i:02d}_by_flight") for i in (1, 4))
     overall = []
     for count in (1, 2):
-        found = forms[:count], scatter.Varies()
+        found = forms[:count], {}
         monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, found=found: found)
         model = SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
         overall.append(diagnose_flights.explain(model, laws=False).overall)

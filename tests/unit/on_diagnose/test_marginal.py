@@ -14,7 +14,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
-from visthrow.diagnose.likelihood.stack import Stack, statistics
+from visthrow.diagnose.likelihood.stack import Integrals, Stack, integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 EFFECTS = catalogue(6)
@@ -22,12 +22,13 @@ EFFECTS = catalogue(6)
 
 def likelihood(gram, levels, window):
     """Logarithm of it, of one window by itself, but for the powers of 2 pi."""
-    return -0.5 * alone(gram, levels, window).square
+    return -0.5 * alone(gram, levels, window).square[0]
 
 
-def alone(gram, levels, window, latents=False):
+def alone(gram, levels, window):
     """What a window says by itself."""
-    return Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram])[0]
+    integrals = Integrals(Stack([gram], windows=[window]), [gram], levels)
+    return integrals.statistics([gram], np.zeros(0))
 
 
 @fixture(scope="module")
@@ -54,29 +55,33 @@ def dense(window, gram, levels, floors, at):
 
 def test_information_and_score_are_those_of_the_dense_covariance(fitted):
     _, windows, floors, levels, grams = fitted
+    extended = [marginal.with_latent_effects(gram) for gram in grams]
+    part = integrals(extended, levels).statistics(extended, np.zeros(len(EFFECTS)))
     for at in (0, 7):
         v, s = dense(windows[at], grams[at], levels, floors, at)
-        part = statistics(grams, levels)[at]
         inverse = np.linalg.inv(v)
-        assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
-        assert_allclose(part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6)
-        g = windows[at].latent
-        whole = g.T @ inverse @ g
-        assert_allclose(part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max())
-        assert_allclose(
-            part.latent_score, g.T @ inverse @ windows[at].residual, rtol=1e-5, atol=1e-3
-        )
+        columns = np.hstack((s, windows[at].latent @ grams[at].factor))
+        information = columns.T @ inverse @ columns
+        score = columns.T @ inverse @ windows[at].residual
+        for effects in (slice(len(EFFECTS)), slice(len(EFFECTS), columns.shape[1])):
+            whole = information[effects, effects]
+            near = 1e-6 * np.abs(whole).max()
+            assert_allclose(part.information[at, effects, effects], whole, rtol=1e-6, atol=near)
+            assert_allclose(part.score[at, effects], score[effects], rtol=1e-6, atol=1e-4)
 
 
 def test_windows_say_the_same_in_one_batch_and_alone(fitted):
     _, _, _, levels, grams = fitted
-    together = Stack(grams).integrals(levels, latents=True).shares(grams)
-    for w, (gram, share) in enumerate(zip(grams, together)):
-        by_itself = alone(gram, levels, w, latents=True)
+    extended = [marginal.with_latent_effects(gram) for gram in grams]
+    together = integrals(extended, levels).statistics(extended, np.zeros(len(EFFECTS)))
+    for w, gram in enumerate(extended):
+        by_itself = alone(gram, levels, w)
+        size = by_itself.score.shape[1]
         for name in ("information", "score", "square"):
-            expected = getattr(by_itself, name)
+            expected = getattr(by_itself, name)[0]
+            values = getattr(together, name)[w][(slice(size),) * expected.ndim]
             scale = np.abs(expected).max()
-            assert_allclose(getattr(share, name), expected, rtol=0.0, atol=1e-9 * scale)
+            assert_allclose(values, expected, rtol=0.0, atol=1e-9 * scale)
 
 
 def test_likelihood_is_that_of_the_dense_covariance(fitted):
@@ -112,7 +117,7 @@ def test_broken_derivatives_are_told_with_their_window(fitted):
         DiagnoseError,
         match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular",
     ):
-        Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).values(fitted[3])
+        Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).fitted(fitted[3])
 
 
 @mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])

@@ -16,17 +16,16 @@ from visthrow.diagnose.apply import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import diagnose_flights, result, verdicts
-from visthrow.diagnose.select.candidates import NOTHING, Candidate, random_shares, shared
-from visthrow.diagnose.select.occam import Linear, window
-from visthrow.diagnose.select.scatter import (
+from visthrow.diagnose.select.candidates import (
     DAY,
     FLIGHT,
-    Scatter,
-    Varies,
-    freed,
-    own_shares,
-    relinearised_per_flight,
+    NOTHING,
+    Candidate,
+    random_shares,
+    shared,
 )
+from visthrow.diagnose.select.occam import Linear, window
+from visthrow.diagnose.select.scatter import Scatter, freed, own_shares, relinearised_per_flight
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -121,13 +120,15 @@ def test_a_drift_is_told_with_its_size_and_its_days():
     )
 
 
+def share(j, group, size):
+    """Random shares of one effect, with their deviation in its floors."""
+    return {Candidate(group, (j,), group, deviations=(1.0,)): size}
+
+
 def test_a_mean_is_as_sure_as_there_are_days():
     """Three flights of a day tell no more of what all days share than one does."""
     statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
-    by_flight, by_day = (
-        freed(statistics, Varies(days, {(0, FLIGHT): 6.0})),
-        freed(statistics, Varies(days, {(0, DAY): 6.0})),
-    )
+    by_flight, by_day = (freed(statistics, share(0, who, 6.0), days) for who in (FLIGHT, DAY))
     assert len(by_day.flights) == 5
     sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
     assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
@@ -138,7 +139,7 @@ def test_shares_of_days_come_before_those_of_flights():
     moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
     statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
     shares = own_shares(
-        statistics, np.zeros(len(NAMES)), Varies(days, {(0, FLIGHT): 1.0, (0, DAY): 10.0})
+        statistics, np.zeros(len(NAMES)), share(0, FLIGHT, 1.0) | share(0, DAY, 10.0), days
     )
     assert_allclose(shares[:, 0], moved, atol=0.5)
     assert np.all(shares[:, 1:] == 0.0)
@@ -228,7 +229,7 @@ def test_a_deviation_is_about_the_mean():
 def test_what_flights_have_of_their_own_is_integrated_out():
     found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
     left, own, score = (
-        freed(found, Varies((), {(j, FLIGHT): size})),
+        freed(found, share(j, FLIGHT, size)),
         found.information[0],
         found.score[0],
     )

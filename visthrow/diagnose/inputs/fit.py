@@ -87,25 +87,22 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     posterior = np.linalg.inv(point.information[np.ix_(columns, columns)] + np.diag(slab**-2.0))
     floors = problem.priors.floor[columns]
     identified = np.sqrt(np.diag(posterior)) < UNKNOWN_SHARE * slab
-    after = model.residuals(problem.sizes(point.theta))
     return FitResult(
         tuple(free),
         units=tuple(model.effects[i].unit for i in columns),
         theta=point.theta[columns] * floors,
         covariance=posterior * np.outer(floors, floors) + np.diag(floors**2),
         identified=tuple(identified.tolist()),
-        rms_before=_rms(model, before, [w.residual for w in before]),
-        rms_after=_rms(model, before, after),
+        rms_before=_rms(model, before),
+        rms_after=_rms(model, point.windows),
         middle_speed=model.middle_speed,
     )
 
 
-def _rms(
-    model: Model, windows: Sequence[Window], residuals: Sequence[np.ndarray]
-) -> dict[str, float]:
+def _rms(model: Model, windows: Sequence[Window]) -> dict[str, float]:
     """Return the residual of each channel that the windows hold, in its unit."""
     channel = np.concatenate([w.channel for w in windows])
-    squares = np.concatenate(residuals) ** 2
+    squares = np.concatenate([w.residual for w in windows]) ** 2
     return {
         name: float(np.sqrt(np.mean(squares[channel == i])))
         for i, name in enumerate(model.channels)

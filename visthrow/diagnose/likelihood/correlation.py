@@ -23,6 +23,8 @@ from typing import TypeVar
 
 import numpy as np
 from numpy import ndarray
+from scipy.optimize import minimize
+from scipy.special import expit, logit
 
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
@@ -37,19 +39,18 @@ SUSPECT = 0.1
 it has a deviation of 0.01.
 """
 
-PERIODS = 2.0 ** np.arange(0.0, 5.25, 0.25)
-"""Correlation times that are tried, in the samples' period: at low frequencies, noise of second
-order goes with the time's fourth power.
-"""
 LONGEST = 0.15
 """Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something
 that the model lacks.
 """
-STRIDES = (4, 2, 1)  # steps among them, one after the other
 
-SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
-"""Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within
+SHARES = 0.5, 0.999
+"""Limits of the correlated part of the variance; the rest keeps the correlations' inverse within
 what doubles hold.
+"""
+
+START = np.array([[1.4, 3.0], [2.5, 3.0], [1.4, 5.0]])
+"""Where the search begins: logarithm of the time in the samples' periods, and of the share's odds.
 """
 
 # windows that the estimate is made of, and that tell whether a question is worth asking all
@@ -129,7 +130,7 @@ def correlations(
         scale = _suspected(free, residuals, channel)
         if scale is None:
             continue
-        best, nats = _climbed(free, channels, correlations_of, channel, scale)
+        best, nats = _likeliest(free, channels, correlations_of, channel, scale)
         if nats > VERY_STRONG:
             correlations_of[channel] = best
     return correlations_of
@@ -172,73 +173,52 @@ def _suspected(
     return float(np.sqrt(square / len(together)))
 
 
-def _climbed(
+def _likeliest(
     windows: Sequence[Window],
     channels: int,
     correlations_of: Mapping[int, Correlation],
     channel: int,
     scale: float,
 ) -> tuple[Correlation, float]:
-    """The likeliest correlation of a channel beside those known, uphill over a grid, and its nats
-    above white noise.
-    """
+    """The likeliest correlation of a channel beside those known, and its nats above white noise."""
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
     period = float(np.median(np.concatenate(steps)))
-    scores: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
+    white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
+    none = max(_likelihood(windows, channels, correlations_of, channel, w)[0] for w in white)
+    best = -np.inf, white[0]
+    if period > LONGEST:
+        return best[1], 0.0
     levels: noise.Noise | None = None
-    times = int(np.searchsorted(PERIODS * period, LONGEST))
-    if not times:
-        return Correlation(period, 0.0, 1), 0.0
 
-    def tried(place: tuple[int, int, int]) -> float:
-        nonlocal levels
-        if place not in scores:
-            guess = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
-            tried_of = {**correlations_of, channel: guess}
-            value, levels = _likelihood(windows, channels, tried_of, levels)
-            scores[place] = value, replace(guess, scale=scale * levels.scale[channel])
-        return scores[place][0]
+    def shortfall(place: ndarray, order: int) -> float:
+        nonlocal best, levels
+        guess = Correlation(period * np.exp(place[0]), float(expit(place[1])), order, scale)
+        value, levels = _likelihood(windows, channels, correlations_of, channel, guess, levels)
+        if value > best[0]:
+            best = value, replace(guess, scale=scale * levels.scale[channel])
+        return -value
 
-    begins = [(min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)]
-    best = max(begins, key=tried)
-    for stride in STRIDES:
-        while True:
-            better = max(_neighbours(best, stride, times), key=tried, default=best)
-            if tried(better) <= tried(best):
-                break
-            best = better
-    if best[0] == times - 1:  # it would last for still longer
-        return scores[best][1], 0.0
-    value, likeliest = scores[best]
-    white = []
-    for deviation in (1.0, scale):
-        none = Correlation(period, 0.0, 1, deviation)
-        white.append(_likelihood(windows, channels, {**correlations_of, channel: none})[0])
-    return likeliest, value - max(white)
-
-
-def _neighbours(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
-    """Places beside one: others of so many times, and while these are far apart, other shares and
-    the other order.
-    """
-    time, share, order = place
-    neighbours = [(time + step, share, order) for step in (-stride, stride)]
-    if stride == STRIDES[0]:
-        neighbours += [(time, share + step, order) for step in (-1, 1)]
-        neighbours.append((time, share, 3 - order))
-    return [p for p in neighbours if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
+    bounds = [(0.0, np.log(LONGEST / period)), logit(SHARES)]
+    order = min((1, 2), key=lambda order: shortfall(START[0], order))
+    options = {"initial_simplex": START, "xatol": np.inf, "fatol": noise.ENOUGH_NATS}
+    minimize(shortfall, START[0], (order,), "Nelder-Mead", bounds=bounds, options=options)
+    value, likeliest = best
+    lasts = likeliest.time > 0.9 * LONGEST  # it would last for still longer
+    return likeliest, 0.0 if lasts else value - none
 
 
 def _likelihood(
     windows: Sequence[Window],
     channels: int,
     correlations_of: Mapping[int, Correlation],
+    channel: int,
+    guess: Correlation,
     start: noise.Noise | None = None,
 ) -> tuple[float, noise.Noise]:
-    """Log marginal likelihood of windows, and their levels; ``start``: where these are searched
-    from.
+    """Log marginal likelihood of windows with a guess of a channel's correlation, and their levels;
+    ``start``: where these are searched from.
     """
-    correlated = with_correlations(windows, correlations_of)
+    correlated = with_correlations(windows, {**correlations_of, channel: guess})
     grams = parallel_map(partial(hidden_gram, channels=channels), correlated)
     shaped = correlated_of(grams, correlated, noise.CORRELATION_TIMES[1])
     levels, value = noise.roughly(shaped, start)

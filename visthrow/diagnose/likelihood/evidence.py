@@ -149,7 +149,7 @@ class Posterior:
     def of(statistics: Statistics, priors: Priors) -> "Posterior":
         """Return what all flights say together."""
         information = statistics.information.sum(0)
-        return Posterior(information, statistics.absolute.sum(0), priors)
+        return Posterior(information, statistics.absolute.score.sum(0), priors)
 
     def _factor(self, deviation: ndarray) -> ndarray:
         """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.

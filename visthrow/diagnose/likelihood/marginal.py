@@ -15,7 +15,7 @@ multiplied into G once, after which P is diagonal.
 Effects are measured in floors throughout: theta = 1 is the size below which an effect does not
 matter."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -64,15 +64,27 @@ class Gram:
     latent_block: ndarray  # shape (L,)
     # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
     factor: ndarray
-    visibility: Mapping[
-        int, float
-    ]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
 
     @property
     def latents(self) -> int:
         """Number of latent-force coefficients."""
         return len(self.latent_block)
+
+    @cached_property
+    def visibility(self) -> dict[int, float]:
+        """Return the median inner product of each latent block's columns with themselves."""
+        latents = slice(self.nuisances, self.hidden)
+        squares = np.diagonal(self.inner, axis1=1, axis2=2).sum(0)[latents]
+        return {
+            block: float(np.median(squares[self.latent_block == block]))
+            for block in np.unique(self.latent_block).tolist()
+        }
+
+    @property
+    def hidden(self) -> int:
+        """Number of columns that are integrated out: nuisances and latents."""
+        return self.nuisances + self.latents
 
 
 @dataclass(frozen=True)
@@ -97,11 +109,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Everything that F flights say about K effects, in floors, about the linearisation point
-    ``theta``.
+    """Everything that F flights, or windows or groups of either, say about K effects, in floors,
+    about the linearisation point ``theta``.
     """
 
-    flights: ndarray  # their numbers, shape (F,)
+    flights: ndarray  # number of each row's flight or group, shape (F,)
     information: ndarray  # S' V^-1 S, shape (F, K, K)
     score: ndarray  # S' V^-1 r, shape (F, K)
     square: ndarray  # r' V^-1 r + log det V, shape (F,)
@@ -109,26 +121,42 @@ class Statistics:
     theta: ndarray  # shape (K,)
 
     @cached_property
-    def absolute(self) -> ndarray:
-        """Scores about theta = 0, shape (F, K)."""
-        return self.score + self.information @ self.theta
+    def absolute(self) -> "Statistics":
+        """Return the statistics about theta = 0."""
+        return self.about(np.zeros(len(self.theta)))
 
-    @cached_property
-    def absolute_square(self) -> ndarray:
-        """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
-        curved = self.information @ self.theta
-        return self.square + 2.0 * self.score @ self.theta + curved @ self.theta
+    def about(self, theta: ndarray) -> "Statistics":
+        """Return the statistics of the residuals extrapolated to other sizes, shape (K,)."""
+        change = self.theta - theta
+        score = self.score + self.information @ change
+        square = self.square + (self.score + score) @ change
+        return replace(self, score=score, square=square, theta=theta)
 
-    def only(self, keep: ndarray) -> "Statistics":
-        """Return the statistics of some flights; ``keep`` is a mask or indices into ``flights``."""
+    def first(self, count: int) -> "Statistics":
+        """Return what is said of the first effects alone; the others keep their sizes."""
         return replace(
             self,
-            flights=self.flights[keep],
-            information=self.information[keep],
-            score=self.score[keep],
-            square=self.square[keep],
-            samples=self.samples[keep],
+            information=self.information[:, :count, :count],
+            score=self.score[:, :count],
+            theta=self.theta[:count],
         )
+
+    def only(self, keep: ndarray) -> "Statistics":
+        """Return the statistics of some rows; ``keep`` is a mask or indices."""
+        return self._with_rows(self.flights[keep], lambda values: values[keep])
+
+    def by(self, groups: Sequence[int]) -> "Statistics":
+        """Add up rows by group; ``groups``: number of each row's, shape (F,)."""
+        numbers, row = np.unique(groups, return_inverse=True)
+        order = np.argsort(row, kind="stable")
+        first = np.searchsorted(row[order], np.arange(len(numbers)))
+        return self._with_rows(numbers, lambda values: np.add.reduceat(values[order], first))
+
+    def _with_rows(self, flights: ndarray, change: Callable[[ndarray], ndarray]) -> "Statistics":
+        information = change(self.information)
+        score = change(self.score)
+        square = change(self.square)
+        return Statistics(flights, information, score, square, change(self.samples), self.theta)
 
 
 def columns(window: Window, floors: ndarray) -> ndarray:
@@ -145,35 +173,7 @@ def gram_of(window: Window, floors: ndarray, channels: int) -> Gram:
     ``channels``: number C of the model's channels. Raises DiagnoseError: the window's arrays do not
     fit together, or hold NaN or infinity."""
     check(window, len(floors), channels)
-    return _inner_products(window, columns(window, floors), channels)
-
-
-def hidden_gram(window: Window, channels: int) -> Gram:
-    """Return the Gram matrix of a window without its effects.
-
-    Raises DiagnoseError: as :func:`gram_of`.
-    """
-    return gram_of(replace(window, effects=window.effects[:, :0]), np.zeros(0), channels)
-
-
-def without_effects(gram: Gram) -> Gram:
-    """Return a Gram matrix of nuisances and latents alone."""
-    size = gram.nuisances + gram.latents
-    inner = np.ascontiguousarray(gram.inner[:, :size, :size])
-    return replace(gram, inner=inner, cross=gram.cross[:, :size])
-
-
-def whitened(window: Window, values: ndarray) -> ndarray:
-    """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
-    for rows, factor in window.correlated:
-        group = values[rows].reshape(len(rows), -1)
-        white = lapack.dtrtrs(factor, group, lower=1)[0]
-        values[rows] = white.reshape(*rows.shape, -1)
-    return values
-
-
-def _inner_products(window: Window, z: ndarray, channels: int) -> Gram:
-    z = whitened(window, z / window.sigma[:, None])
+    z = whitened(window, columns(window, floors) / window.sigma[:, None])
     r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
     size = z.shape[1]
     inner = np.zeros((channels, size, size))
@@ -202,17 +202,38 @@ def _inner_products(window: Window, z: ndarray, channels: int) -> Gram:
         states,
         blocks,
         np.eye(len(blocks)),
-        _information_by_block(inner, states, blocks),
         log_sigma,
     )
 
 
-def _information_by_block(inner: ndarray, begin: int, blocks: ndarray) -> dict[int, float]:
-    """See :class:`Gram`, with ``begin`` the first latent column."""
-    squares = np.diagonal(inner, axis1=1, axis2=2).sum(0)[begin : begin + len(blocks)]
-    return {
-        block: float(np.median(squares[blocks == block])) for block in np.unique(blocks).tolist()
-    }
+def hidden_gram(window: Window, channels: int) -> Gram:
+    """Return the Gram matrix of a window without its effects.
+
+    Raises DiagnoseError: as :func:`gram_of`.
+    """
+    return gram_of(replace(window, effects=window.effects[:, :0]), np.zeros(0), channels)
+
+
+def without_effects(gram: Gram) -> Gram:
+    """Return a Gram matrix of nuisances and latents alone."""
+    inner = np.ascontiguousarray(gram.inner[:, : gram.hidden, : gram.hidden])
+    return replace(gram, inner=inner, cross=gram.cross[:, : gram.hidden])
+
+
+def with_latent_effects(gram: Gram) -> Gram:
+    """Return a Gram matrix whose unit latents are effects as well, behind the others."""
+    columns = np.r_[: len(gram.cross[0]), gram.nuisances : gram.hidden]
+    inner = gram.inner[:, columns[:, None], columns]
+    return replace(gram, inner=inner, cross=gram.cross[:, columns])
+
+
+def whitened(window: Window, values: ndarray) -> ndarray:
+    """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
+    for rows, factor in window.correlated:
+        group = values[rows].reshape(len(rows), -1)
+        white = lapack.dtrtrs(factor, group, lower=1)[0]
+        values[rows] = white.reshape(*rows.shape, -1)
+    return values
 
 
 def check(window: Window, effects: int, channels: int) -> None:
@@ -238,6 +259,10 @@ def check(window: Window, effects: int, channels: int) -> None:
         raise DiagnoseError(
             f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0"
         )
+    knots = np.unique(window.latent_time)
+    groups = len(window.latent_time) // max(len(knots), 1)
+    if not np.array_equal(window.latent_time, np.tile(knots, groups)):
+        raise DiagnoseError(f"{where}: latent forces differ in their knots, or in the knots' order")
     if not finite(window):
         raise DiagnoseError(f"{where}: a residual or a derivative is not finite")
 
@@ -259,7 +284,7 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     factor = knot_factor(window, time)
     knots = len(factor)
     groups = gram.latents // knots
-    part = slice(gram.nuisances, gram.nuisances + gram.latents)
+    part = slice(gram.nuisances, gram.hidden)
     channels, size = gram.cross.shape
     inner = gram.inner.copy()
     rows = factor.T @ inner[:, part].reshape(channels, groups, knots, size)
@@ -269,35 +294,17 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     cross = gram.cross.copy()
     turned = cross[:, part].reshape(-1, knots) @ factor
     cross[:, part] = turned.reshape(channels, -1)
-    visibility = _information_by_block(inner, gram.nuisances, gram.latent_block)
     whole = np.kron(np.eye(groups), factor)
-    return replace(gram, inner=inner, cross=cross, factor=whole, visibility=visibility)
+    return replace(gram, inner=inner, cross=cross, factor=whole)
 
 
 def knot_factor(window: Window, time: float) -> ndarray:
-    """Cholesky factor of the latents of one group of a window, which is that of all others; see
+    """Cholesky factor of a window's latents of one block and axis, which is that of all others; see
     :func:`correlated`.
     """
-    group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
-    knots = _knots(group, window.latent_time)
-    stamps = window.latent_time[:knots]
-    members = group[:knots]
-    lag = np.abs(stamps[:, None] - stamps)
-    alike = np.where(members[:, None] == members, np.exp(-lag / time), 0.0)
-    return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
-
-
-def _knots(group: ndarray, time: ndarray) -> int:
-    """Knots of groups that follow one another with the same ones each; where they do not, all
-    latents are one.
-    """
-    count = int(np.count_nonzero(group == group[0]))
-    if len(group) % count:
-        return len(group)
-    groups = group.reshape(-1, count)
-    times = time.reshape(-1, count)
-    alike = np.all(groups == groups[:, :1]) and np.all(times == times[0])
-    return count if alike else len(group)
+    knots = np.unique(window.latent_time)
+    lag = np.abs(knots[:, None] - knots)
+    return np.linalg.cholesky(np.exp(-lag / time) + 1e-9 * np.eye(len(knots)))
 
 
 def grams_of(windows: Sequence[Window], floors: ndarray, channels: int) -> list[Gram]:
@@ -357,39 +364,15 @@ def residual_after_fit(window: Window, fit: ndarray) -> ndarray:
     return residual
 
 
-@dataclass(frozen=True)
-class WindowStatistics:
-    """One window's share of :class:`Statistics`."""
+def without_rounding(information: ndarray, grams: Sequence[Gram]) -> ndarray:
+    """Return windows' information without what rounding left of it, shape (W, K, K).
 
-    information: ndarray  # shape (K, K)
-    score: ndarray  # shape (K,)
-    square: float
-
-
-@dataclass(frozen=True)
-class LatentStatistics(WindowStatistics):
-    """A window's statistics, with those of its latent forces as if they were effects."""
-
-    latent_information: ndarray  # G' V^-1 G, shape (L, L)
-    latent_score: ndarray  # G' V^-1 r, shape (L,)
-    latent_effects: ndarray  # G' V^-1 S, shape (L, K)
-
-
-def gather(grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: ndarray) -> Statistics:
-    """Add up windows by flight.
-
-    ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out
-    negative beyond rounding."""
-    flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
-    size = len(theta)
-    information = np.zeros((len(flights), size, size))
-    samples = np.zeros(len(flights))
+    Raises DiagnoseError: it came out negative beyond rounding."""
+    size = information.shape[1]
     squares = np.zeros(size)
-    for i, gram, part in zip(row, grams, parts):
-        information[i] += part.information
-        samples[i] += gram.count.sum()
-        begin = gram.cross.shape[1] - size
-        squares += np.diagonal(gram.inner, axis1=1, axis2=2)[:, begin:].sum(0)
+    for gram in grams:
+        part = np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.hidden :].sum(0)
+        squares[: len(part)] += part
     silent = np.diagonal(information.sum(0)) < ROUNDING * squares
     information[:, silent] = 0.0
     information[:, :, silent] = 0.0
@@ -405,25 +388,4 @@ def gather(grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: ndar
         # rounding, which wide priors of several named effects would turn into evidence; what says
         # nothing of an effect stays silent
         information -= 2.0 * lowest * information * np.eye(size)
-    none = np.zeros((len(flights), size))
-    silenced = Statistics(flights, information, none, np.zeros(len(flights)), samples, none[0])
-    return rescored(silenced, grams, parts, theta)
-
-
-def rescored(
-    statistics: Statistics,
-    grams: Sequence[Gram],
-    parts: Sequence[WindowStatistics],
-    theta: ndarray,
-) -> Statistics:
-    """Return statistics of windows with other residuals: their information stays.
-
-    ``statistics``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
-    """
-    which = np.searchsorted(statistics.flights, [gram.flight for gram in grams])
-    score = np.zeros_like(statistics.score)
-    square = np.zeros_like(statistics.square)
-    np.add.at(score, which, [part.score for part in parts])
-    np.add.at(square, which, [part.square for part in parts])
-    score[:, np.diagonal(statistics.information.sum(0)) == 0.0] = 0.0
-    return replace(statistics, score=score, square=square, theta=np.array(theta, dtype=float))
+    return information

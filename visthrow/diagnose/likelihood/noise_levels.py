@@ -149,13 +149,12 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
 @dataclass(frozen=True)
 class _Layout:
     """The places of levels among the parameters of the search: phases' levels, windows' shares of
-    them, sensor scales.
-    """
+    them by block, sensor scales.
+
+    What shows nowhere has no slope, and stays as it is."""
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
-    pairs: ndarray  # (window, block) of each share, shape (S, 2)
-    phases: ndarray  # of each share, the number of its phase's level, shape (S,)
-    measured: ndarray  # channels with samples
+    phases: ndarray  # number of the level that each share is of, shape (W B,)
     # 1 where a parameter moves a window's own level of a block, or scale of a channel; shape
     # (P, W (B + C))
     moves: csr_array
@@ -164,69 +163,50 @@ class _Layout:
     def numbered(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters."""
         keys = tuple(sorted(noise.latent_sd))
-        index = {key: i for i, key in enumerate(keys)}
-        pairs = []
-        phases = []
-        for w, gram in enumerate(grams):
-            for block in np.unique(gram.latent_block).tolist():
-                if (block, gram.phase) in index:
-                    pairs.append((w, block))
-                    phases.append(index[block, gram.phase])
-        pairs = np.array(pairs, dtype=int).reshape(-1, 2)
-        phases = np.array(phases, dtype=int)
-        samples = sum(gram.count for gram in grams)
-        measured = np.flatnonzero(samples > 0)
-        blocks = len(LATENT_BLOCKS)
-        width = blocks + len(samples)
-        first_scale = len(keys) + len(pairs)
-        shares = np.arange(len(keys), first_scale)
-        levels = pairs @ [width, 1]
-        places_of_scales = blocks + measured + width * np.arange(len(grams))[:, None]
-        scales = first_scale + np.tile(np.arange(len(measured)), len(grams))
-        parameters = np.concatenate((phases, shares, scales))
-        places = np.concatenate((levels, levels, places_of_scales.ravel()))
-        shape = first_scale + len(measured), width * len(grams)
+        number = {key: i for i, key in enumerate(keys)}
+        windows, blocks = noise.share.shape
+        pairs = [(block, gram.phase) for gram in grams for block in range(blocks)]
+        phases = np.array([number.get(pair, 0) for pair in pairs], dtype=int)
+        shares = len(keys) + np.arange(len(phases))
+        first_scale = len(keys) + len(phases)
+        scales = np.tile(first_scale + np.arange(len(noise.scale)), (windows, 1))
+        moved = np.hstack((phases.reshape(windows, -1), scales))
+        places = np.arange(moved.size).reshape(moved.shape)
+        parameters = np.concatenate((moved.ravel(), shares))
+        places = np.concatenate((places.ravel(), places[:, :blocks].ravel()))
+        shape = first_scale + len(noise.scale), moved.size
         moves = csr_array((np.ones(len(places)), (parameters, places)), shape=shape)
-        return _Layout(keys, pairs, phases, measured, moves)
+        return _Layout(keys, phases, moves)
 
     @property
     def shares(self) -> slice:
         """Return the place of the windows' shares among the parameters."""
         first = len(self.keys)
-        return slice(first, first + len(self.pairs))
-
-    @property
-    def places(self) -> tuple[ndarray, ndarray]:
-        """Return window and block of each share."""
-        return tuple(self.pairs.T)
+        return slice(first, first + len(self.phases))
 
     def pack(self, noise: Noise) -> ndarray:
         """Logarithms of all levels, shape (P,)."""
         levels = [noise.latent_sd[key] for key in self.keys]
-        return np.log(
-            np.concatenate((levels, noise.share[self.places], noise.scale[self.measured]))
-        )
+        return np.log(np.concatenate((levels, noise.share.ravel(), noise.scale)))
 
     def unpack(self, x: ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""
         sizes = np.exp(x)
         shares = self.shares
-        share = noise.share.copy()
-        scale = noise.scale.copy()
-        share[self.places] = sizes[shares]
-        scale[self.measured] = sizes[shares.stop :]
         levels = dict(zip(self.keys, sizes.tolist()))
-        return replace(noise, scale=scale, share=share, latent_sd=levels)
+        share = sizes[shares].reshape(noise.share.shape)
+        return replace(noise, scale=sizes[shares.stop :], share=share, latent_sd=levels)
 
     def limits(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
         """Lowest and highest values of the parameters."""
         guess = _first_guess(grams).latent_sd
-        visible = np.log([guess[key] for key in self.keys])
+        visible = [guess[key] for key in self.keys]
+        channels = len(grams[0].count)
         limits = []
         for level, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS):
-            shares = np.full(len(self.pairs), np.log(share))
-            scales = np.full(len(self.measured), np.log(scale))
-            limits.append(np.concatenate((np.log(level) + visible, shares, scales)))
+            shares = np.full(len(self.phases), share)
+            scales = np.full(channels, scale)
+            limits.append(np.log(np.concatenate((np.multiply(level, visible), shares, scales))))
         return tuple(limits)
 
 
@@ -317,7 +297,7 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, nda
     curved = bsr_array((curvatures, windows[:-1], windows))
     slope = layout.moves @ slopes.ravel()
     curvature = (layout.moves @ curved @ layout.moves.T).toarray()
-    inverse = noise.share[layout.places] ** -2.0
+    inverse = noise.share.ravel() ** -2.0
     slope[layout.shares] += TAIL * (inverse - 1.0)
     diagonal = np.einsum("ii->i", curvature)  # a view
     diagonal[layout.shares] += 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
@@ -366,7 +346,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
-    fits = Stack(shaped, device).fitted(noise)
+    fits, _ = Stack(shaped, device).fitted(noise)
     for fit, gram in zip(fits, shaped):
         latents = fit[gram.nuisances :]
         fit[gram.nuisances :] = gram.factor @ latents

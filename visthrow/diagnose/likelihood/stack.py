@@ -11,17 +11,13 @@ from typing import TypeVar
 import numpy as np
 import torch
 from numpy import ndarray
-from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
-    LatentStatistics,
     Noise,
     Statistics,
-    WindowStatistics,
-    gather,
-    rescored,
+    without_rounding,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
@@ -62,35 +58,12 @@ class _Shape:
     log_det: torch.Tensor  # of V, shape (W,)
 
 
-def integrals(
-    grams: Sequence[Gram], noise: Noise, device: str = "cpu", *, latents: bool = False
-) -> "Integrals":
-    """Integrate initial states out of windows, and latent forces unless they are asked for.
+def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Integrals":
+    """Integrate initial states and latent forces out of windows.
 
-    Raises DiagnoseError: as :meth:`Stack.values`.
+    Raises DiagnoseError: as :meth:`Stack.fitted`; information came out negative beyond rounding.
     """
-    return Stack(grams, device).integrals(noise, latents)
-
-
-def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[LatentStatistics]:
-    """Return the statistics of windows, with those of their latent forces at the knots as if they
-    were effects.
-    """
-    whole = integrals(grams, noise, device, latents=True)
-    return parallel_map(_of_latents, whole.shares(grams), grams)
-
-
-def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:
-    latents = slice(gram.latents)
-    effects = slice(gram.latents, None)
-    whole = share.information
-    # from unit latents to knots
-    inverse = lapack.dtrtri(gram.factor, lower=1)[0] if gram.latents else gram.factor
-    plain = whole[effects, effects], share.score[effects], share.square
-    information = inverse.T @ whole[latents, latents] @ inverse
-    score = inverse.T @ share.score[latents]
-    cross = inverse.T @ whole[latents, effects]
-    return LatentStatistics(*plain, information, score, cross)
+    return Integrals(Stack(grams, device), grams, noise)
 
 
 class Stack:
@@ -106,78 +79,57 @@ class Stack:
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
         self.device = device
         size = BATCH if device == "cpu" else max(len(grams), 1)
-        self._sizes = [gram.nuisances + gram.latents for gram in grams]
+        self._sizes = [gram.hidden for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
-        self._order = [order[first : first + size] for first in range(0, len(order), size)]
-        parts = [[grams[w] for w in members] for members in self._order]
-        self._batches = parallel_map(self._padded, parts, [rows[m] for m in self._order])
+        self.order = [order[first : first + size] for first in range(0, len(order), size)]
+        parts = [[grams[w] for w in members] for members in self.order]
+        self.batches = parallel_map(self._padded, parts, [rows[m] for m in self.order])
 
     def _padded(self, grams: list[Gram], windows: ndarray) -> _Batch:
-        sizes = [gram.nuisances + gram.latents for gram in grams]
         count = len(grams)
-        channels = len(grams[0].count)
-        n = max(sizes)
-        cross = np.zeros((count, channels, n))
+        n = max(gram.hidden for gram in grams)
         member = np.zeros((count, n, BLOCKS))
         initial = np.zeros((count, n))
-        for w, (gram, size) in enumerate(zip(grams, sizes)):
-            latents = np.arange(gram.nuisances, size)
-            cross[w, :, :size] = gram.cross[:, :size]
+        for w, gram in enumerate(grams):
+            latents = np.arange(gram.nuisances, gram.hidden)
             member[w, latents, gram.latent_block] = 1.0
             initial[w, : gram.nuisances] = 1.0
-        square = np.stack([gram.square for gram in grams])
+        cross, _, square = _residual_products(grams, n, 0)
         counts = np.stack([gram.count for gram in grams])
         log_sigma = np.array([gram.log_sigma for gram in grams])
         arrays = cross, square, counts, log_sigma, member, initial
         tensors = [torch.from_numpy(array).to(self.device) for array in arrays]
-        parts = [gram.inner[:, :size, :size] for gram, size in zip(grams, sizes)]
-        hidden = side_by_side(parts, (channels, n, n), self.device)
+        parts = [gram.inner[:, : gram.hidden, : gram.hidden] for gram in grams]
+        hidden = side_by_side(parts, (counts.shape[1], n, n), self.device)
         return _Batch(windows, grams, hidden, *tensors)
 
-    def values(self, noise: Noise) -> ndarray:
-        """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
+    def fitted(self, noise: Noise) -> tuple[list[ndarray], ndarray]:
+        """Most probable initial state and unit latent forces of each window, shape (D + L,), and
+        the log-likelihood of its residuals, but for the powers of 2 pi, shape (W,).
 
         Raises DiagnoseError: the normal equations are not positive definite, which only broken
         derivatives can cause."""
 
-        def solve(batch: _Batch) -> tuple[torch.Tensor]:
-            _, value = _solved(_shape(batch, noise), batch)
-            return (value,)
-
-        parts = [values for (values,) in self._of_batches(solve)]
-        return np.array(_by_window(self._order, parts))
-
-    def fitted(self, noise: Noise) -> list[ndarray]:
-        """Most probable initial state and unit latent forces of each window, shape (D + L,).
-
-        Raises DiagnoseError: as :meth:`values`.
-        """
-
-        def fit(batch: _Batch) -> tuple[torch.Tensor]:
+        def fit(batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
             shape = _shape(batch, noise)
-            mean, _ = _solved(shape, batch)
-            return (shape.level * mean,)
+            mean, value = _solved(shape, batch)
+            return shape.level * mean, value
 
-        parts = [rows for (rows,) in self._of_batches(fit)]
-        return [row[:size] for row, size in zip(_by_window(self._order, parts), self._sizes)]
+        fits, values = (_by_window(self.order, part) for part in zip(*self._of_batches(fit)))
+        return [fit[:size] for fit, size in zip(fits, self._sizes)], np.array(values)
 
     def look(self, noise: Noise) -> tuple[ndarray, ndarray, ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
         levels.
 
-        Raises DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B
+        Raises DiagnoseError: as :meth:`fitted`. Returns values (W,); gradients (W, B + C) by the B
         blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the
         scales share with the fitted columns is given to the channels by their part in them."""
         parts = self._of_batches(lambda batch: _looked(batch, noise))
-        return tuple(np.array(_by_window(self._order, column)) for column in zip(*parts))
-
-    def integrals(self, noise: Noise, latents: bool) -> "Integrals":
-        """See :func:`integrals`."""
-        parts = parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches)
-        return Integrals(self._order, parts)
+        return tuple(np.array(_by_window(self.order, column)) for column in zip(*parts))
 
     def _of_batches(self, function) -> list[tuple[ndarray, ...]]:
-        return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self._batches)
+        return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self.batches)
 
 
 def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> list[T]:
@@ -294,100 +246,93 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
     return value, torch.cat((by_block[..., 0], by_scale), -1), curvature
 
 
+def _residual_products(
+    grams: Sequence[Gram], hidden: int, effects: int
+) -> tuple[ndarray, ndarray, ndarray]:
+    """Return the products of residuals with the columns that are integrated out, shape (W, C,
+    hidden), with the first effects, shape (W, C, effects), and with themselves, shape (W, C).
+    """
+    square = np.stack([gram.square for gram in grams])
+    of_hidden = np.zeros((*square.shape, hidden))
+    of_effects = np.zeros((*square.shape, effects))
+    for w, gram in enumerate(grams):
+        of_hidden[w, :, : gram.hidden] = gram.cross[:, : gram.hidden]
+        part = gram.cross[:, gram.hidden :][:, :effects]
+        of_effects[w, :, : part.shape[1]] = part
+    return of_hidden, of_effects, square
+
+
 @dataclass(frozen=True)
 class _Integrated:
-    """The remainder of the last J columns of a batch."""
+    """The remainder of a batch's effects; of windows with fewer of them, the last are 0."""
 
-    own_columns: list[ndarray]  # which of the J columns are a window's own
     shape: _Shape
     weight: ndarray  # of the channels, shape (C,)
-    # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
+    # L^-1 P^1/2 U' W S, with L of the posterior's precision, shape (W, n, K)
     half: torch.Tensor
-    information: list[ndarray]  # of each window
+    information: ndarray  # shape (W, K, K)
 
-    def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
-        """Return the windows' statistics with the residuals of grams of the same derivatives."""
-        weight = self.weight
-        count, n, columns = self.half.shape
-        hidden = np.zeros((count, n))
-        effects = np.zeros((count, columns))
-        for w, (gram, kept_columns) in enumerate(zip(grams, self.own_columns)):
-            cross = weight @ gram.cross
-            size = gram.nuisances + gram.latents
-            hidden[w, :size] = cross[:size]
-            effects[w, kept_columns] = cross[len(cross) - len(kept_columns) :]
-        right = self.shape.level * torch.from_numpy(hidden).to(self.half.device)
+    def of_residuals(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
+        """Return scores, shape (W, K), and squares, shape (W,), with the residuals of grams of the
+        same derivatives.
+        """
+        hidden, effects, square = _residual_products(grams, *self.half.shape[1:])
+        right = self.shape.level * torch.from_numpy(self.weight @ hidden).to(self.half.device)
         projected = torch.linalg.solve_triangular(self.shape.factor, right[:, :, None], upper=False)
         explained = self.half.mT @ projected
-        square = self.shape.log_det - projected.square().sum((1, 2))
-        explained, square = all_to_host((explained[..., 0], square))
-        results = []
-        for w, gram in enumerate(grams):
-            score = (effects[w] - explained[w])[self.own_columns[w]]
-            whole = float(weight @ gram.square + square[w])
-            results.append(WindowStatistics(self.information[w], score, whole))
-        return results
+        part = self.shape.log_det - projected.square().sum((1, 2))
+        explained, part = all_to_host((explained[..., 0], part))
+        return self.weight @ effects - explained, square @ self.weight + part
 
 
 class Integrals:
     """The part of windows' statistics that no residual changes; it stays on the device."""
 
-    def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
-        """Keep it; ``order``: numbers of each batch's windows."""
-        self._order = order
-        self._parts = batches
-        self._gathered: Statistics | None = None  # by flights, with the first residuals
+    def __init__(self, stack: Stack, grams: Sequence[Gram], noise: Noise):
+        """Integrate at some noise levels; ``grams``: of the stack."""
+        self._order = stack.order
+        count = max(len(gram.cross[0]) - gram.hidden for gram in grams)
+        self._parts = parallel_map(lambda batch: _integrated(batch, noise, count), stack.batches)
+        parts = [part.information for part in self._parts]
+        self._information = without_rounding(self._by_window(parts), grams)
+        self._flights = np.array([gram.flight for gram in grams])
+        self._samples = np.array([gram.count.sum() for gram in grams])
 
     @property
-    def log_dets(self) -> list[float]:
-        """Return the log determinant of each window's V."""
-        return _by_window(self._order, [part.shape.log_det.tolist() for part in self._parts])
+    def log_dets(self) -> ndarray:
+        """Return the log determinant of each window's V, shape (W,)."""
+        return self._by_window([part.shape.log_det.tolist() for part in self._parts])
 
-    def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
-        """Return the windows' statistics with the residuals of grams of the same derivatives."""
-        parts = []
-        for members, part in zip(self._order, self._parts):
-            parts.append(part.shares([grams[w] for w in members]))
-        return _by_window(self._order, parts)
+    def _by_window(self, parts: Sequence[Sequence]) -> ndarray:
+        return np.array(_by_window(self._order, parts))
 
     def statistics(self, grams: Sequence[Gram], theta: ndarray) -> Statistics:
-        """Return the statistics of flights with the residuals of grams of the same derivatives.
+        """Return the statistics of windows with the residuals of grams of the same derivatives.
 
-        ``theta``: where these residuals are, in floors, shape (K,). Raises DiagnoseError: as
-        :func:`~visthrow.diagnose.likelihood.marginal.gather`."""
-        shares = self.shares(grams)
-        if self._gathered is not None:
-            return rescored(self._gathered, grams, shares, theta)
-        self._gathered = gather(grams, shares, theta)
-        return self._gathered
+        ``theta``: where these residuals are, in floors; the sizes of further effects are 0."""
+        pairs = zip(self._order, self._parts)
+        parts = [part.of_residuals([grams[w] for w in members]) for members, part in pairs]
+        score, square = map(self._by_window, zip(*parts))
+        score[:, np.diagonal(self._information.sum(0)) == 0.0] = 0.0
+        sizes = np.zeros(score.shape[1])
+        sizes[: len(theta)] = theta
+        fixed = self._flights, self._information
+        return Statistics(*fixed, score, square, self._samples, sizes)
 
 
-def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
+def _integrated(batch: _Batch, noise: Noise, count: int) -> _Integrated:
+    """Integrate a batch of windows; ``count``: most effects of any window."""
     shape = _shape(batch, noise)
     _, channels, n = batch.cross.shape
-    sizes = [gram.nuisances + gram.latents for gram in batch.grams]
-    inner = [gram.inner for gram in batch.grams]
-    width = len(batch.grams[0].inner[0]) - sizes[0]
+    device = str(batch.square.device)
 
     def weighed(parts: Sequence[ndarray], height: int) -> torch.Tensor:
-        device = str(batch.square.device)
-        return _weighed(shape.weight, side_by_side(parts, (channels, height, width), device))
+        return _weighed(shape.weight, side_by_side(parts, (channels, height, count), device))
 
-    right = weighed([part[:, :size, size:] for part, size in zip(inner, sizes)], n)
-    effects = weighed([part[:, size:, size:] for part, size in zip(inner, sizes)], width)
-    if latents:
-        hidden = _weighed(shape.weight, batch.hidden)
-        above = torch.cat((hidden, right), 2)
-        below = torch.cat((right.mT, effects), 2)
-        right = above
-        effects = torch.cat((above, below), 1)
+    right = weighed([g.inner[:, : g.hidden, g.hidden :] for g in batch.grams], n)
+    effects = weighed([g.inner[:, g.hidden :, g.hidden :] for g in batch.grams], count)
     scaled = shape.level[:, :, None] * right
     half = torch.linalg.solve_triangular(shape.factor, scaled, upper=False)
     reduced = effects - half.mT @ half
-    whole = (0.5 * (reduced + reduced.mT)).cpu().numpy()
-    columns = [np.arange(width)] * len(sizes)
-    if latents:
-        begins = [gram.nuisances for gram in batch.grams]
-        columns = [np.r_[begin:size, n : n + width] for begin, size in zip(begins, sizes)]
-    information = [values[np.ix_(rows, rows)] for values, rows in zip(whole, columns)]
-    return _Integrated(columns, shape, noise.scale**-2.0, half, information)
+    information = (0.5 * (reduced + reduced.mT)).cpu().numpy()
+    return _Integrated(shape, noise.scale**-2.0, half, information)

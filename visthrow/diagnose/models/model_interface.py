@@ -45,7 +45,8 @@ class Window:
     latent_axis: ndarray = field(
         default_factory=lambda: np.zeros(0, dtype=int)
     )  # 0, 1, 2 for x, y, z, shape (G,)
-    latent_time: ndarray = field(default_factory=lambda: np.zeros(0))  # of the knot [s], shape (G,)
+    # of the knot [s], shape (G,): each block and axis has the same ones, in order
+    latent_time: ndarray = field(default_factory=lambda: np.zeros(0))
     knots: Mapping[str, ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
     the catalogue: ``time``, ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N],
@@ -105,17 +106,15 @@ class Model(Protocol):
         """
         ...
 
-    def residuals(
-        self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[ndarray]:
+    def residuals(self, theta: Mapping[str, float], linearised: Linearised) -> list[ndarray]:
         """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
 
         Args:
             theta: sizes of the effects.
-            linearised: where the caller's derivatives were taken. Initial states begin with those
-                of that place and follow the effects; what that does by the derivatives is added to
-                the residuals again, which so are those of b = 0. A model that fits initial states
-                in every simulation has no need of it.
+            linearised: where the caller's derivatives were taken, with the same kinds of blocks.
+                Initial states begin with those of that place and follow the effects; what that does
+                by the derivatives is added to the residuals again, which so are those of b = 0. A
+                model that fits initial states in every simulation has no need of it.
         """
         ...
 

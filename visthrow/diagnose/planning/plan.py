@@ -254,8 +254,8 @@ def expected_information(
         latent_sd=_expected_levels(noise, {w.phase for w in windows}),
         share=np.ones((len(windows), len(LATENT_BLOCKS))),
     )
-    parts = integrals(grams, expected).shares(grams)
-    information = np.sum([part.information for part in parts], axis=0)
+    flown_theta = np.zeros(len(floors))
+    information = integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
     # both catalogues name the same effects, each in floors of its own
     places = np.zeros((len(names), len(floors)))
     for i, name in enumerate(names):

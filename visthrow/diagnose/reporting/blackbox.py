@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.stack import statistics
+from visthrow.diagnose.likelihood.marginal import with_latent_effects
+from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
@@ -113,16 +115,21 @@ def train(
 
     ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
     shape (K,); default 0."""
-    shift = point.statistics.theta - (0.0 if theta is None else theta)
     names, row = np.unique(groups, return_inverse=True)
     size = table.columns(point.windows[0]).shape[1]
     information = np.zeros((len(names), size, size))
     score = np.zeros((len(names), size))
-    parts = statistics(point.grams, point.noise, point.device)
-    for window, part, f in zip(point.windows, parts, row):
-        columns = table.columns(window)
-        information[f] += columns.T @ part.latent_information @ columns
-        score[f] += columns.T @ (part.latent_score + part.latent_effects @ shift)
+    grams = [with_latent_effects(gram) for gram in point.grams]
+    parts = integrals(grams, point.noise, point.device).statistics(grams, point.theta)
+    count = len(point.theta)
+    sizes = np.zeros(len(parts.theta))
+    sizes[:count] = 0.0 if theta is None else theta
+    parts = parts.about(sizes)
+    for w, (window, f) in enumerate(zip(point.windows, row)):
+        columns = solve_triangular(point.grams[w].factor, table.columns(window), lower=True)
+        latents = slice(count, count + len(columns))
+        information[f] += columns.T @ parts.information[w, latents, latents] @ columns
+        score[f] += columns.T @ parts.score[w, latents]
     strongest = dict.fromkeys(table.blocks, 0.0)
     for (block, _), sd in point.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]

@@ -21,7 +21,6 @@ from visthrow.diagnose.select.held_out import (
     Work,
     channel_gains,
     crossed,
-    regrouped,
 )
 from visthrow.diagnose.select.point import Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
@@ -231,8 +230,8 @@ def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> np.ndarra
 
 def _nats(work: Work, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain = regrouped(work.before, cross.groups)
-    named = regrouped(work.after, cross.groups)
+    plain = work.before.by_window.by(cross.groups)
+    named = work.after.by_window.by(cross.groups)
     change = cross.trained - work.after.theta
     quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
     square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic

@@ -5,7 +5,7 @@ A candidate is a group of columns of the windows with a prior and a penalty. Wha
 a set of candidates is worth its marginal likelihood less the penalties of its members.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +16,11 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import FEWEST, Priors
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, EVENT, FLIGHT, Varies
 
 ALL = "all"  # group of a candidate whose size all flights share
+FLIGHT = "flight"  # of one of which each flight has a share of its own
+DAY = "day"
+EVENT = "event"  # one flight alone has one
 
 
 @dataclass(frozen=True)
@@ -164,12 +166,3 @@ def columns_of(chosen: Iterable[Candidate]) -> list[int]:
 def laws_of(chosen: Iterable[Candidate]) -> list[Candidate]:
     """Return the terms of laws."""
     return [c for c in chosen if c.law]
-
-
-def varies_of(shares: Mapping[Candidate, float], days: Sequence[int]) -> Varies:
-    """Return the random shares of candidates; ``shares``: their deviation, in their prior's."""
-    sizes = {}
-    for c, size in shares.items():
-        who = c.flight if c.group == EVENT else c.group
-        sizes |= {(j, who): size * sd for j, sd in zip(c.columns, c.deviations)}
-    return Varies(days, sizes)

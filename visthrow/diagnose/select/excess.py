@@ -97,7 +97,7 @@ def _stack_of(point: Point, phase: str) -> Stack:
 def _likelihood(stack: Stack, noise: Noise, key: tuple[int, str], level: float) -> float:
     """Return the log likelihood of a phase's residuals under a level of a block and phase."""
     tried = replace(noise, latent_sd={**noise.latent_sd, key: level})
-    return float(stack.values(tried).sum())
+    return float(stack.fitted(tried)[1].sum())
 
 
 def _upper_limit(stack: Stack, noise: Noise, key: tuple[int, str]) -> float:
@@ -122,9 +122,8 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
     by_block = {name: np.zeros(len(effects)) for name in LATENT_BLOCKS}
     for gram in point.grams:
         inner = np.tensordot(weight, gram.inner, 1)
-        size = gram.nuisances + gram.latents
-        free = [*range(gram.nuisances), *(size + k for k in free_effects)]
-        columns = size + np.asarray(effects, dtype=int)
+        free = [*range(gram.nuisances), *(gram.hidden + k for k in free_effects)]
+        columns = gram.hidden + np.asarray(effects, dtype=int)
         known = _explained(inner, free, columns)
         total += inner[columns, columns] - known
         for block in np.unique(gram.latent_block):

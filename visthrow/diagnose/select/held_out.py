@@ -29,10 +29,10 @@ from visthrow.diagnose.likelihood.forms import (
     readable,
     unit_of,
 )
-from visthrow.diagnose.likelihood.marginal import Statistics, gather
+from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.candidates import NOTHING, Names, columns_of, shared
+from visthrow.diagnose.select.candidates import DAY, FLIGHT, NOTHING, Names, columns_of, shared
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
@@ -89,12 +89,6 @@ def groups_of(point: Point) -> tuple[list[int], str]:
     return groups, "parts of flights"
 
 
-def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
-    parts = point.integrals.shares(point.grams)
-    grams = [replace(gram, flight=g) for gram, g in zip(point.grams, groups)]
-    return gather(grams, parts, point.theta)
-
-
 def crossed(diagnosis: Diagnosis) -> Crossed:
     """Repeat a selection without each of the flights, by statistics, unless that was done; random
     shares are integrated out. Candidates are sized as in the diagnosis, but predict nothing.
@@ -106,7 +100,10 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     point = work.after
     effects = work.problem.effects
     groups, left_out = groups_of(point)
-    statistics = freed(regrouped(point, groups), point.varies.by_flight)
+    shares = {}  # as if every flight were a day
+    for c, size in point.shares.items():
+        shares[replace(c, group=FLIGHT) if c.group == DAY else c] = size
+    statistics = freed(point.by_window.by(groups), shares)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
     trained = np.zeros((count, len(priors.floor)))
@@ -162,7 +159,7 @@ def borne_out(
     information = statistics.information
     promised = 0.5 * np.einsum("i,fij,j->f", theta, information, theta)
     quadratic = np.einsum("fi,fij,fj->f", trained, information, trained)
-    brought = np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic
+    brought = np.einsum("fi,fi->f", trained, statistics.absolute.score) - 0.5 * quadratic
     total = promised.sum()
     if total <= 0.0:
         return 0.0, np.nan, np.nan
@@ -529,12 +526,12 @@ def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, flo
     out beside the names as all flights size them, with its 95 % interval.
 
     ``laws``: numbers of the laws' terms among the effects."""
-    statistics = regrouped(point, groups_of(point)[0])
+    statistics = point.by_window.by(groups_of(point)[0])
     count = len(point.problem.model.effects)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
     rows = statistics.information[:, laws]
     information = rows[:, :, laws]
-    score = statistics.absolute[:, laws] - rows @ names
+    score = statistics.about(names).score[:, laws]
     prior = np.diag(point.problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
     other_information = total - information

@@ -10,7 +10,7 @@ Source: an innovation variance (Harvey 1989) of the command channel; the likelih
 that of a random effect."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy import ndarray
@@ -20,11 +20,19 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import few_of
-from visthrow.diagnose.likelihood.evidence import Posterior, Priors
-from visthrow.diagnose.likelihood.marginal import correlated_of, grams_of
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.marginal import Statistics, correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point
-from visthrow.diagnose.select.scatter import COARSE, COMMAND, REACH, Scatter, judged
+from visthrow.diagnose.select.scatter import (
+    COARSE,
+    COMMAND,
+    REACH,
+    Scatter,
+    evidence_of,
+    integrated,
+    judged,
+)
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
 
@@ -35,76 +43,43 @@ From half of it as a deviation 0 and 1 are told apart: half way is two from both
 """
 
 
-@dataclass(frozen=True)
-class CommandStatistics:
-    """Statistics of windows of K effects and T commands each, about 0; windows of fewer commands
-    have columns of 0.
+def statistics_of(
+    point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Sequence[int]
+) -> Statistics:
+    """Return the statistics of windows, with those of T commands behind those of the effects;
+    windows of fewer commands have columns of 0.
+
+    Args:
+        point: whose noise levels are taken.
+        windows: with residuals at the point.
+        columns: of each window's commands, shape (N, T).
+        rows: numbers of the windows among the point's.
     """
+    longest = max(changes.shape[1] for changes in columns)
+    wide = []
+    for window, changes in zip(windows, columns):
+        padded = np.zeros((len(window.residual), longest))
+        padded[: len(changes), : changes.shape[1]] = changes
+        wide.append(replace(window, effects=np.hstack((window.effects, padded))))
+    problem = point.problem
+    floors = np.append(problem.priors.floor, np.ones(longest))
+    grams = grams_of(wide, floors, len(problem.model.channels))
+    grams = correlated_of(grams, wide, point.noise.correlation_time)
+    noise = levels.only(point.noise, grams, rows)
+    return stack.integrals(grams, noise, point.device).statistics(grams, point.theta)
 
-    information: ndarray  # shape (W, K + T, K + T)
-    score: ndarray  # shape (W, K + T)
-    commands: int  # T
 
-    @staticmethod
-    def of(
-        point: Point,
-        windows: Sequence[Window],
-        columns: Sequence[ndarray],
-        rows: Sequence[int],
-    ) -> "CommandStatistics":
-        """Ask windows under a point's noise levels.
-
-        Args:
-            point: where the windows' residuals are.
-            windows: whose initial states and latent forces are integrated out.
-            columns: of each window's commands, shape (N, T).
-            rows: numbers of the windows among the point's.
-        """
-        longest = max(changes.shape[1] for changes in columns)
-        wide = []
-        for window, changes in zip(windows, columns):
-            padded = np.zeros((len(window.residual), longest))
-            padded[: len(changes), : changes.shape[1]] = changes
-            wide.append(replace(window, effects=np.hstack((window.effects, padded))))
-        problem = point.problem
-        floors = np.append(problem.priors.floor, np.ones(longest))
-        grams = grams_of(wide, floors, len(problem.model.channels))
-        grams = correlated_of(grams, wide, point.noise.correlation_time)
-        noise = levels.only(point.noise, grams, rows)
-        shares = stack.integrals(grams, noise, point.device).shares(grams)
-        information = np.array([share.information for share in shares])
-        score = np.array([share.score for share in shares])
-        score += information[:, :, : len(point.theta)] @ point.theta
-        return CommandStatistics(information, score, longest)
-
-    def gain(self, shares: ndarray, priors: Priors, active: Sequence[int]) -> ndarray:
-        """Nats of these shares of dropped commands against none, beside a set of effects."""
-        evidence = [self._evidence(p, priors, active) for p in [0.0, *shares.tolist()]]
-        return np.array(evidence[1:]) - evidence[0]
-
-    def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
-        effects = slice(0, -self.commands)
-        commands = slice(-self.commands, None)
-        information = self.information[:, effects, effects].sum(0)
-        score = self.score[:, effects].sum(0)
-        value = 0.0
-        if share > 0.0:
-            variance = share * (1.0 - share)
-            mean = np.full(self.commands, share)
-            inner = self.information[:, commands, commands]
-            unit = np.eye(self.commands)
-            crossed = self.information[:, commands, effects]
-            came = self.score[:, commands]
-            remaining = came - inner @ mean
-            right = np.concatenate((remaining[..., None], crossed), axis=2)
-            solved = np.linalg.solve(inner + unit / variance, right)
-            explained = (right.transpose(0, 2, 1) @ solved).sum(0)
-            mean_gain = mean @ (came + remaining).sum(0)
-            log_det = np.linalg.slogdet(unit + variance * inner)[1].sum()
-            value = 0.5 * float(mean_gain + explained[0, 0] - log_det)
-            information = information - explained[1:, 1:]
-            score = score - mean @ crossed.sum(0) - explained[1:, 0]
-        return value + Posterior(information, score, priors).log_evidence(active)
+def _evidence(
+    statistics: Statistics, share: float, priors: Priors, sets: Sequence[Sequence[int]]
+) -> ndarray:
+    """Return log Z of each set of effects where that share of the commands did not come."""
+    effects = len(priors.floor)
+    theta = statistics.theta.copy()
+    theta[effects:] = share
+    deviation = np.sqrt(share * (1.0 - share))
+    commands = [(j, deviation) for j in range(effects, len(theta))]
+    came = integrated(statistics.about(theta), commands).first(effects)
+    return np.array([evidence_of(came, priors, named) for named in sets])
 
 
 def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | None:
@@ -126,8 +101,9 @@ def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | 
         if not columns:
             return None
         windows = [point.windows[w] for w in rows]
-        statistics = CommandStatistics.of(point, windows, columns, rows)
-        nats = np.minimum(*(statistics.gain(shares, priors, named) for named in sets))
+        statistics = statistics_of(point, windows, columns, rows)
+        evidence = [_evidence(statistics, p, priors, sets) for p in (0.0, *shares.tolist())]
+        nats = (np.array(evidence[1:]) - evidence[0]).min(axis=1)
         if nats.max() <= 0.0:
             return None
     count = sum(changes.shape[1] for changes in columns)
@@ -142,11 +118,13 @@ def sized(point: Point, scatter: Scatter) -> Scatter:
     the verdict before."""
     windows = [point.about.windows[i] for i in point.problem.kept]
     rows = range(len(windows))
-    statistics = CommandStatistics.of(point, windows, point.commands, rows)
-    commands = slice(-statistics.commands, None)
+    statistics = statistics_of(point, windows, point.commands, rows)
+    commands = slice(len(point.theta), None)
+    half_way = np.zeros(len(statistics.theta))
+    half_way[commands] = EITHER
+    score = statistics.about(half_way).score[:, commands]
     information = statistics.information[:, commands, commands]
-    spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)
-    score = statistics.score[:, commands] - EITHER * information.sum(2)  # from half way
+    spread = np.linalg.inv(information + np.eye(information.shape[1]) / EITHER**2)
     off = (spread @ score[..., None])[..., 0]
     variance = np.diagonal(spread, axis1=1, axis2=2)
     clear = np.sqrt(variance) < 0.5 * EITHER

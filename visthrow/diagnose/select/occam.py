@@ -13,7 +13,7 @@ the same.
 Source: Madigan and Raftery 1994 (Occam's window); Raftery 1995.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -23,19 +23,20 @@ from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG, Posterior
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import (
     ALL,
+    DAY,
     EVENT,
+    FLIGHT,
     NOTHING,
     Candidate,
     Names,
     columns_of,
-    varies_of,
 )
 from visthrow.diagnose.select.scatter import (
     COARSE,
-    DAY,
-    FLIGHT,
     REACH,
+    Shares,
     by_day,
+    drifting,
     evidence_of,
     freed,
     over_deviations,
@@ -104,7 +105,7 @@ class Linear:
     def profile(
         self,
         chosen: Names,
-        fixed: Mapping[Candidate, float],
+        fixed: Shares,
         c: Candidate,
         sizes: ndarray = REACH,
     ) -> tuple[ndarray, ndarray]:
@@ -113,12 +114,12 @@ class Linear:
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active = columns_of(chosen)
-        days = {share: size for share, size in fixed.items() if share.group == DAY}
+        days = drifting(fixed)
         flights = {share: size for share, size in fixed.items() if share not in days}
-        statistics = freed(self.statistics, varies_of(flights, self.days))
+        statistics = freed(self.statistics, flights)
         nats = []
         for shares in (days, *({**days, c: size} for size in sizes.tolist())):
-            varied = freed(statistics, varies_of(shares, self.days))
+            varied = freed(statistics, shares, self.days)
             nats.append(evidence_of(varied, self.priors, active))
         return sizes, np.array(nats[1:]) - nats[0]
 
@@ -135,7 +136,7 @@ class Linear:
         return self._values[chosen]
 
     def _freed(self, chosen: Names) -> Statistics:
-        return freed(self.statistics, varies_of(self.shares(chosen)[0], self.days))
+        return freed(self.statistics, self.shares(chosen)[0], self.days)
 
     def total(self, chosen: Names) -> Posterior:
         """Return what all flights say beside a set's random shares."""
@@ -188,7 +189,7 @@ class Linear:
         """Return the nats that random shares of one group promise beside these sizes [floors]."""
         flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
         precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
-        misfit = (flights.absolute - flights.information @ theta) ** 2 / precision
+        misfit = (flights.about(theta).score) ** 2 / precision
         counts = [len(c.columns) for c in members]
         columns = [j for c in members for j in c.columns]
         deviations = [sd for c in members for sd in c.deviations]

@@ -32,7 +32,7 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
-from visthrow.diagnose.select.scatter import Varies, freed, own_shares
+from visthrow.diagnose.select.scatter import Shares, freed, own_shares
 
 ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,
@@ -137,16 +137,17 @@ class Point:
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     plain: Statistics  # of flights without anything of their own
-    varies: Varies  # effects that differ from flight to flight, or from day to day
+    shares: Shares  # of effects that differ from flight to flight, or from day to day
     integrals: stack.Integrals  # of the grams under these noise levels
-    about: (
-        Linearised | None
-        # where the model's derivatives were taken; None: with another kind of block than the
-        # residuals
-    )
+    about: Linearised  # where the model's derivatives were taken
     commands: Sequence[
         ndarray
     ]  # change of each window by each command that did not come, shape (N, T); none: all came
+
+    @cached_property
+    def by_window(self) -> Statistics:
+        """Return the statistics of windows without anything of their own."""
+        return self.integrals.statistics(self.grams, self.theta)
 
     @property
     def device(self) -> str:
@@ -158,7 +159,7 @@ class Point:
         """Return the statistics of what flights share: each flight's random shares are integrated
         out.
         """
-        return freed(self.plain, self.varies)
+        return freed(self.plain, self.shares, self.problem.days)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -179,7 +180,7 @@ class Point:
 
     def evidence(self, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
-        misfit = 0.5 * float(self.statistics.absolute_square.sum())
+        misfit = 0.5 * float(self.statistics.absolute.square.sum())
         return self.posterior.log_evidence(active) - misfit + self.noise.log_prior
 
 
@@ -191,8 +192,13 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
     changed = replace(point, **changes)
     if integrals is None:
         integrals = stack.integrals(changed.grams, changed.noise, changed.device)
-    plain = integrals.statistics(changed.grams, changed.theta)
+    plain = _by_flight(integrals, changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
+
+
+def _by_flight(integrals: stack.Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
+    statistics = integrals.statistics(grams, theta)
+    return statistics.by(statistics.flights)
 
 
 def linearise(
@@ -200,12 +206,12 @@ def linearise(
     theta: ndarray,
     start: Noise | None = None,
     windows: Sequence[Window] | None = None,
-    varies: Varies | None = None,
+    shares: Shares | None = None,
 ) -> Point:
     """Simulate and linearise at ``theta``, estimate the noise levels, gather.
 
     ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
-    model gave there, if it was asked already; ``varies``: effects that differ among flights."""
+    model gave there, if it was asked already; ``shares``: random ones of effects."""
     theta = problem.possible(theta)
     sizes = problem.sizes(theta)
     flown = problem.flown(theta)
@@ -227,8 +233,7 @@ def linearise(
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
-    statistics = integrals.statistics(grams, theta)
-    varies = varies or Varies(problem.days)
+    statistics = _by_flight(integrals, grams, theta)
     return Point(
         problem,
         theta,
@@ -236,7 +241,7 @@ def linearise(
         grams,
         noise,
         statistics,
-        varies,
+        shares or {},
         integrals,
         linearised,
         commands,
@@ -303,10 +308,9 @@ def untracked_windows(point: Point) -> list[int]:
 
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
     lost, but something is missing."""
-    grams = with_shares(point, point.theta)
-    shares = point.integrals.shares(grams)
-    squares = np.array([share.square for share in shares]) - point.integrals.log_dets
-    misfit = squares / [max(gram.count.sum(), 1.0) for gram in grams]
+    statistics = point.integrals.statistics(with_shares(point, point.theta), point.theta)
+    squares = statistics.square - point.integrals.log_dets
+    misfit = squares / np.maximum(statistics.samples, 1.0)
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
     # what an unknown motion does is no effect's doing
     limit = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)
@@ -317,17 +321,15 @@ def untracked_windows(point: Point) -> list[int]:
 
 
 def moved(point: Point, theta: ndarray) -> Point | None:
-    """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the
-    simulation fails there.
+    """Simulate at ``theta``, with the same kinds of blocks, but keep the derivatives and noise
+    levels of ``point``; None where the simulation fails there.
     """
     problem = point.problem
     theta = problem.possible(theta)
-    kinds = problem.switches
-    linearised = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
     flown = problem.flown(theta)
     count = len(problem.model.effects)  # a term's column stays that of where derivatives were taken
     sizes = problem.priors.floor[count:] * theta[count:] * (flown is None)
-    simulated = (flown or problem.model).residuals(problem.sizes(theta), linearised)
+    simulated = (flown or problem.model).residuals(problem.sizes(theta), point.about)
     residuals = []
     for k, (i, window) in enumerate(zip(problem.kept, point.windows)):
         residual = simulated[i] - window.effects[:, count:] @ sizes
@@ -344,7 +346,6 @@ def moved(point: Point, theta: ndarray) -> Point | None:
         theta=np.array(theta, dtype=float),
         windows=windows,
         grams=grams,
-        about=linearised,
     )
 
 
@@ -360,8 +361,7 @@ def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int])
     for old, new in zip(origin.windows, moved_point.windows):
         bent.append(new.residual - (old.residual - old.effects @ change))
     grams = with_residuals(moved_point.grams, moved_point.windows, floors, bent)
-    shares = moved_point.integrals.shares(grams)
-    total = sum(share.score for share in shares)
+    total = moved_point.integrals.statistics(grams, moved_point.theta).score.sum(0)
     return moved_point.posterior.covariance(active) @ total
 
 
@@ -402,7 +402,7 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
     """Return the inner products of a point's windows at ``theta``, and with each flight's random
     shares beside it.
     """
-    shares = own_shares(point.plain, theta, point.varies) + theta - point.theta
+    shares = own_shares(point.plain, theta, point.shares, point.problem.days) + theta - point.theta
     if not shares.any():
         return list(point.grams)
     row = np.searchsorted(point.plain.flights, [gram.flight for gram in point.grams])
@@ -411,7 +411,7 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
 
 def shifted(gram: Gram, change: ndarray) -> Gram:
     """Inner products of r - S change."""
-    begin = gram.nuisances + gram.latents
+    begin = gram.hidden
     part = gram.inner[:, :, begin:] @ change
     mixed = gram.cross[:, begin:] @ change
     square = gram.square - 2.0 * mixed + part[:, begin:] @ change
@@ -508,18 +508,3 @@ def candidates(
     if not pairs or points[0].device == "cpu":
         return [simulated(i) for i in range(len(pairs))]
     return run_concurrently(simulated, range(len(pairs)))
-
-
-def switched(point: Point, active: Sequence[int]) -> ndarray | None:
-    """Return where a set is to be linearised, in floors, if it asks for another kind of block than
-    a point flies; else None.
-    """
-    kinds = point.problem.switches
-    off = [j for j in active if kinds[j] and point.theta[j] == 0.0]
-    if not off:
-        return None
-    columns = list(active)
-    theta = np.zeros(len(point.theta))
-    theta[columns] = point.theta[columns]
-    theta[off] = 1.0 / point.problem.priors.floor[off]
-    return theta

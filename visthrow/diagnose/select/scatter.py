@@ -7,7 +7,7 @@ is simulated again at other sizes: a release 40 ms early tells twice of it by it
 Source: Laird and Ware 1982 (random effects).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,16 +17,20 @@ from scipy.interpolate import PchipInterpolator
 from sim.effects.effect import RandomEffect
 from visthrow.diagnose.likelihood.evidence import INEXACT, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.candidates import DAY, EVENT, FLIGHT, Candidate
 
-FLIGHT = "flight"  # what has a share of its own
-DAY = "day"
-COMMAND = "command"
-EVENT = "event"  # one flight alone has one
+COMMAND = "command"  # what has a share of its own, beside flights and days
 REACH = np.geomspace(0.02, 6.0, 25)
 """Deviations that are tried, in their prior's."""
 COARSE = 3  # one of so many of them suffices to compare candidates
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
+Shares = Mapping[Candidate, float]
+"""Deviation of random shares, in their prior's."""
+Deviations = Iterable[tuple[int, float | ndarray]]
+"""Number of each effect of which rows have shares, and the shares' deviation in floors, of all rows
+or of each, shape (F,).
+"""
 FINE = 400  # places between them at which a curve is looked at
 
 
@@ -64,42 +68,6 @@ class Scatter:
         size = f"{self.name} = {self.size:.3g}{unit} (95 %: {self.low:.3g} to {self.high:.3g})"
         drifts = "drifts, a value for each day. " if self.by == DAY else ""
         return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
-
-
-@dataclass(frozen=True)
-class Varies:
-    """Effects that have random shares, with the shares' deviation in the effect's floors."""
-
-    days: Sequence[int] = ()  # of each flight, by its number; none where the logs do not say
-    # (effect's number, who has shares: FLIGHT, DAY or one flight's number)
-    shares: Mapping[tuple[int, str | int], float] = field(default_factory=dict)
-
-    def __bool__(self) -> bool:
-        return bool(self.shares)
-
-    @property
-    def drifts(self) -> dict[int, float]:
-        """Return the effects with shares of days."""
-        return {j: size for (j, who), size in self.shares.items() if who == DAY}
-
-    @property
-    def columns(self) -> set[int]:
-        """Return the effects that have a share in every flight, or on every day."""
-        return {j for j, who in self.shares if who in (FLIGHT, DAY)}
-
-    @property
-    def by_flight(self) -> "Varies":
-        """Return the same as if every flight were a day."""
-        shares = {}
-        for (j, who), size in self.shares.items():
-            shares[j, FLIGHT if who == DAY else who] = size
-        return Varies((), shares)
-
-    def of(self, statistics: Statistics) -> Iterator[tuple[int, ndarray]]:
-        """Yield effects with the deviation of each flight's share, shape (F,)."""
-        for (j, who), size in self.shares.items():
-            if who != DAY:
-                yield j, size * ((who == FLIGHT) | (statistics.flights == who))
 
 
 def relinearised_per_flight(
@@ -240,87 +208,96 @@ def between_flights(
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
     """Return log Z of a set of effects, comparable between shares that were integrated out."""
-    square = float(statistics.absolute_square.sum())
+    square = float(statistics.absolute.square.sum())
     return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square
 
 
-def freed(statistics: Statistics, varies: Varies) -> Statistics:
+def freed(statistics: Statistics, shares: Shares, days: Sequence[int] = ()) -> Statistics:
     """Statistics of what flights, or days, share: the shares that each has of its own are
     integrated out.
 
-    ``varies``: effects that have such shares. Where days have some, what is returned is of days.
-    """
-    of_flights = integrated(statistics, varies.of(statistics))
-    if not varies.drifts:
+    ``days``: of each flight, by its number. Where days have shares, what is returned is of days."""
+    of_flights = integrated(statistics, _of_rows(shares, statistics.flights))
+    if not drifting(shares):
         return of_flights
-    return integrated(by_day(of_flights, varies.days), varies.drifts.items())
+    of_days = by_day(of_flights, days)
+    return integrated(of_days, _of_rows(shares, of_days.flights, DAY))
+
+
+def drifting(shares: Shares) -> Shares:
+    """Return the shares that days have."""
+    return {c: size for c, size in shares.items() if c.group == DAY}
+
+
+def _of_rows(shares: Shares, numbers: ndarray, group: str = FLIGHT) -> Deviations:
+    """Yield the shares of flights, of all or of one alone, or those of days.
+
+    ``numbers``: of the flights, or days."""
+    for c, size in shares.items():
+        if (c.group == DAY) == (group == DAY):
+            has_share = (c.group != EVENT) | (numbers == c.flight)
+            for j, deviation in zip(c.columns, c.deviations):
+                yield j, size * deviation * has_share
 
 
 def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
-    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
-    member = (row == np.arange(len(names))[:, None]).astype(float)
-    information = np.tensordot(member, statistics.information, 1)
-    score = member @ statistics.score
-    square = member @ statistics.square
-    samples = member @ statistics.samples
-    theta = statistics.theta
-    return Statistics(names, information, score, square, samples, theta)
+    return statistics.by([days[f] for f in statistics.flights.tolist()])
 
 
-def integrated(
-    statistics: Statistics, deviation: Iterable[tuple[int, float | ndarray]]
-) -> Statistics:
-    """Integrate out the shares that each row has of some effects.
-
-    ``deviation``: number of each effect, and the shares' deviation in floors, of all rows or of
-    each, shape (F,)."""
-    for j, size in deviation:
-        column = statistics.information[:, :, j]
-        score = statistics.score
-        scaled = size**2 * column[:, j]
-        part = size**2 / (1.0 + scaled)
-        explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
-        information = np.subtract(statistics.information, explained, out=explained)
-        known = part * score[:, j]
-        square = statistics.square - known * score[:, j] + np.log1p(scaled)
-        score = score - known[:, None] * column
-        statistics = replace(statistics, information=information, score=score, square=square)
-    return statistics
+def integrated(statistics: Statistics, deviations: Deviations) -> Statistics:
+    """Integrate out the shares that each row has of some effects."""
+    columns, root, part, precision = _unit_shares(statistics, deviations)
+    if not columns:
+        return statistics
+    score = (root * statistics.score[:, columns])[..., None]
+    solved = np.linalg.solve(precision, np.concatenate((part, score), axis=2))
+    explained = np.swapaxes(part, 1, 2) @ solved
+    log_det = np.linalg.slogdet(precision)[1]
+    return replace(
+        statistics,
+        information=statistics.information - explained[..., :-1],
+        score=statistics.score - explained[..., -1],
+        square=statistics.square - (score * solved[..., -1:]).sum((1, 2)) + log_det,
+    )
 
 
-def own_shares(statistics: Statistics, theta: ndarray, varies: Varies) -> ndarray:
+def _unit_shares(
+    statistics: Statistics, deviations: Deviations
+) -> tuple[list[int], ndarray, ndarray, ndarray]:
+    """Return the effects' numbers, the shares' deviations (F, m), the information on shares in
+    these and on effects (F, m, K), and the posterior precision of the shares (F, m, m).
+    """
+    pairs = list(deviations)
+    columns = [j for j, _ in pairs]
+    root = np.zeros((len(statistics.score), len(pairs)))
+    for i, (_, size) in enumerate(pairs):
+        root[:, i] = size
+    part = root[..., None] * statistics.information[:, columns]
+    return columns, root, part, np.eye(len(pairs)) + part[..., columns] * root[:, None]
+
+
+def own_shares(
+    statistics: Statistics, theta: ndarray, shares: Shares, days: Sequence[int]
+) -> ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in
     floors, shape (F, K).
 
-    ``theta``: sizes that all flights share, in floors; ``varies``: effects that have shares. Those
-    of days come first, and flights share what is left of them."""
-    positions = np.tile(theta, (len(statistics.flights), 1))
-    if varies.drifts:
-        by_days = by_day(integrated(statistics, varies.of(statistics)), varies.days)
-        days = [varies.days[f] for f in statistics.flights.tolist()]
-        row = np.searchsorted(by_days.flights, days)
-        count = len(by_days.flights)
-        drifts = {j: np.full(count, size) for j, size in varies.drifts.items()}
-        shares = _shares(by_days, np.tile(theta, (count, 1)), drifts)
-        positions = positions + shares[row]
-    sizes: dict[int, ndarray] = {}
-    for j, size in varies.of(statistics):
-        sizes[j] = np.hypot(sizes.get(j, 0.0), size)
-    return positions + _shares(statistics, positions, sizes) - theta
+    ``theta``: sizes that all flights share, in floors. The shares of days come first, and flights
+    share what is left of them."""
+    sizes = np.zeros(statistics.score.shape)
+    of_flights = list(_of_rows(shares, statistics.flights))
+    if drifting(shares):
+        of_days = by_day(integrated(statistics, of_flights), days)
+        row = np.searchsorted(of_days.flights, [days[f] for f in statistics.flights.tolist()])
+        sizes += _shares(of_days, theta, _of_rows(shares, of_days.flights, DAY))[row]
+    return sizes + _shares(statistics, theta + sizes, of_flights)
 
 
-def _shares(statistics: Statistics, theta: ndarray, deviation: Mapping[int, ndarray]) -> ndarray:
-    """Return the most probable shares of each row, beside its sizes ``theta`` (F, K)."""
-    shares = np.zeros(statistics.score.shape)
-    columns = list(deviation)
-    if columns:
-        information = statistics.information[:, columns]
-        known = np.einsum("fij,fj->fi", information, theta - statistics.theta)
-        score = statistics.score[:, columns] - known
-        root = np.stack([deviation[j] for j in columns], axis=1)
-        block = information[:, :, columns] * root[:, :, None] * root[:, None]
-        precision = np.eye(len(columns)) + block
-        scaled = np.linalg.solve(precision, (root * score)[..., None])
-        shares[:, columns] = root * scaled[..., 0]
-    return shares
+def _shares(statistics: Statistics, theta: ndarray, deviations: Deviations) -> ndarray:
+    """Return the most probable shares of each row, shape (F, K), beside its sizes ``theta``."""
+    columns, root, part, precision = _unit_shares(statistics, deviations)
+    known = part @ np.broadcast_to(theta - statistics.theta, statistics.score.shape)[..., None]
+    off = root[..., None] * statistics.score[:, columns, None] - known
+    sizes = root * np.linalg.solve(precision, off)[..., 0]
+    return sizes @ np.eye(len(statistics.theta))[columns]

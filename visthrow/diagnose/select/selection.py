@@ -24,13 +24,11 @@ from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.candidates import (
     NOTHING,
-    Candidate,
     Names,
     columns_of,
     laws_of,
     random_shares,
     shared,
-    varies_of,
     without_means,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases
@@ -44,7 +42,6 @@ from visthrow.diagnose.select.point import (
     fitted,
     linearise,
     predicted_gain,
-    switched,
     with_all_effects_noise,
     with_noise_at,
 )
@@ -61,8 +58,7 @@ class Trial:
 
     chosen: Names
     point: Point
-    shares: Mapping[Candidate, float] = field(default_factory=dict)  # deviations of random shares
-    occam: float = 0.0  # nats by which they are worth more at their best than over their prior
+    occam: float = 0.0  # nats by which random shares are worth more at their best than all sizes
     lead: float = 0.0  # of the best set [nats]
 
     @cached_property
@@ -285,14 +281,13 @@ class Selector:
         columns = [columns_of(s) for s in sets]
         begins = []
         for active, (sizes, _) in zip(columns, shares):
-            varies = varies_of(sizes, self.problem.days)
-            begins.append(replace(self._with_blocks(point, active), varies=varies))
+            begins.append(replace(self._with_blocks(point, active), shares=sizes))
         trials = []
-        for s, outcome, (sizes, occam) in zip(sets, candidates(begins, columns), shares):
+        for s, outcome, (_, occam) in zip(sets, candidates(begins, columns), shares):
             if isinstance(outcome, DiagnoseError):
                 self.progress(f"{names_of(s)}: not simulated, {outcome}")
                 continue
-            trial = Trial(s, outcome, sizes, occam)
+            trial = Trial(s, outcome, occam)
             trial = replace(trial, lead=self._value(trial) - self.value)
             # what may not be named gains nothing
             nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)
@@ -301,12 +296,17 @@ class Selector:
         return trials
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
-        """Return the point linearised with the kinds of blocks that a set asks for; once for each
-        place in a row.
+        """Return the point, or one that was linearised with the kinds of blocks that a set asks
+        for; once for each place in a row.
         """
-        theta = switched(point, active)
-        if theta is None:
-            return point
+        kinds = self.problem.switches
+        chosen = np.isin(np.arange(len(kinds)), active)
+        theta = np.where(chosen, point.theta, 0.0)
+        off = kinds & chosen & (theta == 0.0)
+        theta[off] = 1.0 / self.problem.priors.floor[off]
+        for known in (point, self.nominal):
+            if np.array_equal(known.theta[kinds] != 0.0, theta[kinds] != 0.0):
+                return known
         if theta.tobytes() not in self._turned:
             self._turned = {theta.tobytes(): self._linearised(theta, point)}
         return self._turned[theta.tobytes()]
@@ -330,7 +330,8 @@ class Selector:
         sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
-        sizes = point.theta + own_shares(point.plain, point.theta, point.varies)
+        own = own_shares(point.plain, point.theta, point.shares, self.problem.days)
+        sizes = point.theta + own
         outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
         if np.any(outside & (sizes != 0.0)):
             return False  # a share of a flight has the bounds of its effect, to a floor
@@ -392,12 +393,11 @@ class Selector:
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
         point = self._settled(trial.point, trial.columns, last)
-        if point is not trial.point or trial.shares:
+        if point is not trial.point or point.shares:
             shares, occam = self.linear(point).shares(trial.chosen)
             if shares:
-                varied = replace(point, varies=varies_of(shares, self.problem.days))
-                point = with_noise_at(varied, point.theta)
-            trial = Trial(trial.chosen, point, shares, occam)
+                point = with_noise_at(replace(point, shares=shares), point.theta)
+            trial = Trial(trial.chosen, point, occam)
         self.best = trial
         self._visited.add(trial.chosen)
         self._linear = {self.nominal: self.linear(self.nominal)}
@@ -429,7 +429,7 @@ class Selector:
         return point
 
     def _linearised(self, theta: np.ndarray, like: Point) -> Point:
-        return linearise(self.problem, theta, like.noise, varies=like.varies)
+        return linearise(self.problem, theta, like.noise, shares=like.shares)
 
     def _record(
         self, top: Trial, leads: Mapping[Names, float], listed: Mapping[Names, float]

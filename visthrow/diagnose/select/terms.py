@@ -13,16 +13,17 @@ from functools import lru_cache, partial
 
 import numpy as np
 from numpy import ndarray
+from scipy.linalg import solve_triangular
 
 from visthrow.diagnose.likelihood.evidence import STRONG, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
 from visthrow.diagnose.likelihood.marginal import (
-    LatentStatistics,
+    Statistics,
     correlated_of,
-    gather,
     grams_of,
+    with_latent_effects,
 )
-from visthrow.diagnose.likelihood.stack import statistics
+from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import (
     JOINT,
@@ -38,7 +39,6 @@ from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.excess import LANDING, positions_of
 from visthrow.diagnose.select.point import Point, regathered, with_shares, with_terms
 from visthrow.diagnose.select.result import Law
-from visthrow.diagnose.select.scatter import Varies
 
 LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs
@@ -99,9 +99,10 @@ def level_block(block: str) -> str:
     return "vehicle torque" if block == JOINT else block
 
 
-def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
+def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     """The point as if no phase were much rougher than is usual in its block and each flight's
-    random shares were known, and the statistics of its windows.
+    random shares were known, and the statistics of its windows with unit latents as further
+    effects.
 
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of
     it would stand out."""
@@ -113,15 +114,16 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
-    parts = statistics(grams, noise, point.device)
-    plain = gather(grams, parts, point.theta)
-    return replace(point, noise=noise, grams=grams, plain=plain, varies=Varies()), parts
+    extended = parallel_map(with_latent_effects, grams)
+    parts = integrals(extended, noise, point.device).statistics(extended, point.theta)
+    plain = parts.first(len(point.theta)).by(parts.flights)
+    return replace(point, noise=noise, grams=grams, plain=plain, shares={}), parts
 
 
 class Survey:
     """A record of what windows say of forces at their knots beside a set of names."""
 
-    def __init__(self, point: Point, parts: Sequence[LatentStatistics], active: Sequence[int]):
+    def __init__(self, point: Point, parts: Statistics, active: Sequence[int]):
         """Keep a point and the statistics of its windows; ``active``: the names."""
         posterior = point.posterior
         self.point = point
@@ -154,20 +156,23 @@ class Survey:
         self, w: int, block: str, values_of: Callable[[KnotValues], ndarray]
     ) -> tuple[ndarray, int, ndarray, ndarray, ndarray]:
         """Square, number of knots, information, score and cross information of all terms."""
-        part = self.parts[w]
+        gram = self.point.grams[w]
+        count = len(self.point.theta)
+        latents = slice(count, count + gram.latents)
+        said = self.parts.information[w, latents]
         transfer = through_latents(self.point.windows[w], self.knots[w], block)
         values = values_of(self.knots[w])
-        count, columns = values.shape[2:]
+        terms, columns = values.shape[2:]
         values = values.reshape(transfer.shape[1], -1)
-        latent_block = self.point.grams[w].latent_block
-        acting = latent_block == LATENT_BLOCKS.index(level_block(block))
-        loads = transfer @ values
-        square = (loads[acting] ** 2).sum(0).reshape(count, columns).sum(1)
-        informed = (part.latent_information @ loads).reshape(-1, count, columns)
-        score = (part.latent_score + part.latent_effects @ self.point.theta) @ loads
-        cross = (loads.T @ part.latent_effects).reshape(count, columns, -1)
+        acting = gram.latent_block == LATENT_BLOCKS.index(level_block(block))
+        exerted = transfer[acting] @ values
+        square = (exerted**2).sum(0).reshape(terms, columns).sum(1)
+        loads = solve_triangular(gram.factor, transfer, lower=True) @ values
+        informed = (said[:, latents] @ loads).reshape(-1, terms, columns)
+        score = self.parts.absolute.score[w, latents] @ loads
+        cross = (loads.T @ said[:, :count]).reshape(terms, columns, -1)
         information = np.einsum("lti,ltj->tij", loads.reshape(informed.shape), informed)
-        return square, int(acting.sum()) // 3, information, score.reshape(count, columns), cross
+        return square, int(acting.sum()) // 3, information, score.reshape(terms, columns), cross
 
     def _left(self, screened: Screen) -> tuple[ndarray, ndarray]:
         """Information and score of each term, of what the names leave."""
@@ -294,7 +299,7 @@ def without_laws(point: Point) -> Point:
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
     grams = []
     for gram in point.grams:
-        kept = slice(gram.nuisances + gram.latents + count)
+        kept = slice(gram.hidden + count)
         inner = gram.inner[:, kept, kept]
         cross = gram.cross[:, kept]
         grams.append(replace(gram, inner=inner, cross=cross))

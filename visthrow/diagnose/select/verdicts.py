@@ -2,7 +2,7 @@
 words.
 """
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +20,14 @@ from visthrow.diagnose.models.model_interface import Model, Window
 from visthrow.diagnose.select import result, terms
 from visthrow.diagnose.select.candidates import (
     ALL,
+    DAY,
     EVENT,
+    FLIGHT,
     Candidate,
     Names,
     as_random,
     columns_of,
     laws_of,
-    varies_of,
 )
 from visthrow.diagnose.select.excess import (
     acts_on,
@@ -47,10 +48,8 @@ from visthrow.diagnose.select.point import (
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import (
-    DAY,
-    FLIGHT,
     Scatter,
-    Varies,
+    Shares,
     between_flights,
     by_day,
     freed,
@@ -68,8 +67,9 @@ Answer = tuple[str, str, list[str], set[int]]
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
     model = selection.nominal.problem.model
-    scatter, varies = random_shares_of(selection)
-    point = _varied(selection, varies)
+    scatter, shares = random_shares_of(selection)
+    varying = {j for c in shares if c.group != EVENT for j in c.columns}
+    point = _varied(selection, shares)
     if commands:
         scatter = (*scatter, commands)
     calm = with_floors_noise(point, selection.best.columns)
@@ -86,10 +86,11 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     active = [j for j in selection.names if j not in withdrawn]
     if selection.names and not active:
         point = nominal
-    shared_point = _about_means(point, () if laws_of(selection.best.chosen) else active, varies)
-    sized = tuple(sorted({*active, *varies.columns}))
+    means = () if laws_of(selection.best.chosen) else varying & {*active}
+    shared_point = _about_means(replace(point, shares=shares), active, means)
+    sized = tuple(sorted(varying | {*active}))
     sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
-    means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
+    in_units = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
     reading = Reading(shared_point, active, withdrawn, sets, unlike)
@@ -112,7 +113,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         events=_events(selection, point),
         alone=alone,
         sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
-        scatter=_with_means(scatter, means),
+        scatter=_with_means(scatter, in_units),
         mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
         flights=len(point.plain.flights),
@@ -122,11 +123,11 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     )
 
 
-def _varied(selection: Selector, varies: Varies) -> Point:
+def _varied(selection: Selector, shares: Shares) -> Point:
     """Give the best point these random shares, and return it."""
     point = selection.best.point
-    if varies or point.varies:
-        point = with_noise_at(replace(point, varies=varies), point.theta)
+    if shares or point.shares:
+        point = with_noise_at(replace(point, shares=shares), point.theta)
         selection.best = replace(selection.best, point=point)
     return point
 
@@ -159,7 +160,7 @@ def _covariance(
     return tuple(map(tuple, variance.tolist()))
 
 
-def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
+def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
     """Return the verdicts on what differs among flights or days, of the catalogue and of what was
     selected; and the shares that were selected.
 
@@ -170,7 +171,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
     priors = selection.problem.priors
     catalogue = {v.name: v for v in random_effects()}
     verdicts = []
-    shares = dict(best.shares)
+    shares = dict(best.point.shares)
     for c in _asked_after(selection, catalogue.keys()):
         usual = c not in best.chosen
         statistics = best.point.plain
@@ -179,14 +180,14 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
             beside |= _means_of(selection, c)
         elif len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
-        fixed_shares = {o: size for o, size in best.shares.items() if o != c}
+        fixed_shares = {o: size for o, size in best.point.shares.items() if o != c}
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
         verdicts.append(replace(verdict, found=not usual))
         if not usual:
             shares[c] = max(verdict.size, verdict.floor) / effect.prior_sd
-    return tuple(verdicts), varies_of(shares, problem.days)
+    return tuple(verdicts), shares
 
 
 def _asked_after(selection: Selector, usual: Set[str]) -> list[Candidate]:
@@ -207,7 +208,7 @@ def share_verdict(
     linear: Linear,
     c: Candidate,
     chosen: Names,
-    fixed_shares: Mapping[Candidate, float],
+    fixed_shares: Shares,
     effect: RandomEffect,
     threshold: float,
 ) -> Scatter:
@@ -239,12 +240,13 @@ def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
     return relinearised_per_flight(point.plain, theta, point.problem.priors, j, simulate)
 
 
-def _about_means(point: Point, active: Sequence[int], varies: Varies) -> Point:
+def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) -> Point:
     """Return the point of what flights share, about the means of named effects that vary."""
     statistics = point.plain
-    for j in sorted(varies.columns & set(active)):
+    for j in sorted(varying):
         statistics = _straight(replace(point, plain=statistics), active, j)
-    return replace(point, plain=freed(statistics, varies), varies=Varies())
+    shared = freed(statistics, point.shares, point.problem.days)
+    return replace(point, plain=shared, shares={})
 
 
 def _named_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:

@@ -6,7 +6,6 @@ used for several steps, as long as each brings what it promised, and may come fr
 whose states were fitted before."""
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 
 import numpy as np
 from numpy import ndarray
@@ -301,9 +300,6 @@ def following(
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
     rows = np.arange(len(states["pos_w"]))
-    parts = [states]
-    for _, members in groupby(directions, key=lambda d: d.field):
-        group = list(members)
-        steps = np.diag([d.step for d in group]).repeat(len(rows), axis=0)
-        parts.append(moved_along(rows_of(states, np.tile(rows, len(group))), group, steps))
-    return stacked(parts)
+    steps = np.diag([d.step for d in directions]).repeat(len(rows), axis=0)
+    moved = moved_along(rows_of(states, np.tile(rows, len(directions))), directions, steps)
+    return stacked([states, moved])

@@ -3,7 +3,6 @@ commands.
 """
 
 import dataclasses
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import compress
 from typing import Any
@@ -31,7 +30,6 @@ from visthrow.diagnose.throw.direct import (
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
-    Direction,
     States,
     deviations,
     directions,
@@ -125,11 +123,7 @@ class ThrowModel(Model):
         begun = fitter.fit(states, {})
         # states at theta = 0, and the samples' derivatives by them
         self._nominal = begun, fitter.slopes
-        # by kinds of blocks: the latest states, and what their fit took from windows' residuals
-        self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
-        self._latest[frozenset()] = begun, self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
-        self._lock = threading.Lock()  # residuals may be asked for side by side
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
         """Cut flights into windows, fewer where there are many."""
@@ -192,27 +186,22 @@ class ThrowModel(Model):
         besides poses.
         """
         setting = self.at(theta)
-        self._directions = directions(setting.plant)  # another kind of block has other states
+        ways = directions(setting.plant)  # another kind of block has other states
         states = self._settled_at[_key(theta)] = self._settled(setting)
         entries = self.entries.values()
         steps = np.array([self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[e.apply(setting, step) for e, step in zip(entries, steps)]]
         graded = len(self._graded)
         simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
-        begun = perturbed(states, self._directions)
+        begun = perturbed(states, ways)
         linearisation = Linearisation(
-            self.flights, simulation, self._graded, steps[:graded], self._directions, begun
+            self.flights, simulation, self._graded, steps[:graded], ways, begun
         )
-        lanes = 2 + graded + len(self._directions) + 9 * self.flights.knots[self._retained]
+        lanes = 2 + graded + len(ways) + 9 * self.flights.knots[self._retained]
         room = BATCH if self.device == "cpu" else CUDA_BATCH
         listed: list[Window] = []
         for batch in grouped(self._retained, lanes, room):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
-        present = self._present(self._directions)
-        fitted = []
-        for w, window in zip(self._retained, listed):
-            fitted.append(window.nuisance @ states[MOVED][w, present[w]])
-        self._latest[self._switches(theta)] = states, fitted
         whole = []
         for w, window in zip(self._retained, self._with_switches(theta, listed)):
             whole.append(with_direct(window, w, self._direct, self.channels, settings, steps))
@@ -243,50 +232,30 @@ class ThrowModel(Model):
         Each kind begins in initial states settled for it: a transient that the other's state brings
         would be taken for its effect."""
         on = theta.get(e.name, 0.0) > 0.5
-        elsewhere = {**theta, e.name: 0.0 if on else 1.0}
-        perturbed = self.at(elsewhere)
-        start = self._settled(perturbed)
-        self._latest[self._switches(elsewhere)] = start, self._none
+        elsewhere = self.at({**theta, e.name: 0.0 if on else 1.0})
         sign = -1.0 if on else 1.0
-        _, fitted = self._latest[self._switches(theta)]
+        flown = self._flown(elsewhere, self._settled(elsewhere))
+        moved = self._settled_at[_key(theta)][MOVED]
+        present = deviations(directions(self.at(theta).plant), self.flights.cuts) > 0.0
         columns = []
-        for window, offset, after in zip(windows, fitted, self._flown(perturbed, start)):
-            columns.append(sign * (window.residual - offset - after))
+        for w, window, after in zip(self._retained, windows, flown):
+            fitted = window.residual - window.nuisance @ moved[w, present[w]]
+            columns.append(sign * (fitted - after))
         return columns
-
-    @property
-    def _none(self) -> ndarray:
-        """Return a fit that took nothing from any window."""
-        return np.zeros(len(self._retained))
-
-    def _present(self, ways: Sequence[Direction]) -> ndarray:
-        """Return which directions windows' states have, shape (W, directions), bool."""
-        return deviations(ways, self.flights.cuts) > 0.0
 
     def _flown(self, setting: Setting, states: States) -> list[ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
         lanes = [Lane(w, 0, w) for w in self._retained]
         return self.flights.residuals(self.simulation(setting), states, lanes)
 
-    def residuals(
-        self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[ndarray]:
-        """See :class:`.model_interface.Model`; by default from the states settled last
-        with the same kinds of blocks.
-
-        Until windows are asked for, they are those of the states that were fitted; then those from
-        the middle of the states' prior."""
+    def residuals(self, theta: Mapping[str, float], linearised: Linearised) -> list[ndarray]:
+        """See :class:`.model_interface.Model`."""
         setting = self.at(theta)
-        if linearised is None:
-            states, fitted = self._latest_states(theta, setting)
-            moves = {}
-        else:
-            states, moves = self._following(setting, theta, linearised)
-            fitted = self._none
+        states, moves = self._following(setting, theta, linearised)
         flown = self._flown(setting, states)
         residuals = []
-        for i, (w, residual, offset) in enumerate(zip(self._retained, flown, fitted)):
-            parts = [residual + offset]
+        for i, (w, residual) in enumerate(zip(self._retained, flown)):
+            parts = [residual]
             for kind in self._direct:
                 if w in kind.windows:
                     parts.append(kind.samples(w)[1] - kind.predicted(w, setting))
@@ -305,23 +274,11 @@ class ThrowModel(Model):
         setting = self.at(theta)
         states = self._settled_at.get(_key(theta))
         if states is None:
-            states, _ = self._latest_states(theta, setting)
+            states = self._settled(setting)
         delay = self.setting.plant.vehicle.queue.delay
         return without_each_command(
             self.flights, self._retained[list(windows)], delay, self.simulation(setting), states
         )
-
-    def _latest_states(
-        self, theta: Mapping[str, float], setting: Setting
-    ) -> tuple[States, Sequence]:
-        """Return the states settled last with the same kinds of blocks, in ``setting`` where there
-        are none, and what their fit took from windows' residuals.
-        """
-        kinds = self._switches(theta)
-        with self._lock:
-            if kinds not in self._latest:
-                self._latest[kinds] = self._settled(setting), self._none
-            return self._latest[kinds]
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
@@ -332,7 +289,7 @@ class ThrowModel(Model):
         before = linearised.theta
         change = np.array([theta.get(name, 0.0) - before.get(name, 0.0) for name in self.entries])
         ways = directions(setting.plant)
-        present = self._present(ways)
+        present = deviations(ways, self.flights.cuts) > 0.0
         follows = np.array([x.follows for x in ways])
         lag = self.setting.plant.release.lag
 
@@ -347,10 +304,6 @@ class ThrowModel(Model):
         moved = sizes + begun[MOVED]
         moves = [moved[w, present[w]] for w in numbers]
         return moved_along(begun, ways, sizes), dict(zip(linearised.windows, moves))
-
-    def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
-        """Which other kinds of blocks are on."""
-        return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def step_error(self) -> dict[str, float]:
         """See the base class."""
