@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
+from visthrow.diagnose.likelihood.marginal import with_latent_effects
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
@@ -287,8 +288,10 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     at = beside_a_law(
         SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )
-    parts = terms.statistics(at.best.point.grams, at.best.point.noise, "cpu")
-    of = terms.Survey(at.best.point, parts, []).screen(block)
+    best = at.best.point
+    grams = [with_latent_effects(gram) for gram in best.grams]
+    parts = terms.integrals(grams, best.noise).statistics(grams, best.theta)
+    of = terms.Survey(best, parts, []).screen(block)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
         (point,) = terms.extended([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
         scale = point.problem.priors.floor[-1]
