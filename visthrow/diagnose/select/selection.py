@@ -330,8 +330,8 @@ class Selector:
         sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
-        own = own_shares(point.plain, point.theta, point.shares, self.problem.days)
-        sizes = point.theta + own
+        shares = own_shares(point.plain, point.theta, point.shares, self.problem.days)
+        sizes = point.theta + shares
         outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
         if np.any(outside & (sizes != 0.0)):
             return False  # a share of a flight has the bounds of its effect, to a floor

@@ -159,7 +159,7 @@ class Survey:
         gram = self.point.grams[w]
         count = len(self.point.theta)
         latents = slice(count, count + gram.latents)
-        said = self.parts.information[w, latents]
+        of_latents = self.parts.information[w, latents]
         transfer = through_latents(self.point.windows[w], self.knots[w], block)
         values = values_of(self.knots[w])
         terms, columns = values.shape[2:]
@@ -168,9 +168,9 @@ class Survey:
         exerted = transfer[acting] @ values
         square = (exerted**2).sum(0).reshape(terms, columns).sum(1)
         loads = solve_triangular(gram.factor, transfer, lower=True) @ values
-        informed = (said[:, latents] @ loads).reshape(-1, terms, columns)
+        informed = (of_latents[:, latents] @ loads).reshape(-1, terms, columns)
         score = self.parts.absolute.score[w, latents] @ loads
-        cross = (loads.T @ said[:, :count]).reshape(terms, columns, -1)
+        cross = (loads.T @ of_latents[:, :count]).reshape(terms, columns, -1)
         information = np.einsum("lti,ltj->tij", loads.reshape(informed.shape), informed)
         return square, int(acting.sum()) // 3, information, score.reshape(terms, columns), cross
 
