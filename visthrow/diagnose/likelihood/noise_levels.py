@@ -116,8 +116,11 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
-    """The levels as they concern some of the windows, whose ``grams`` these are."""
-    levels = {key: noise.latent_sd[key] for key in _first_guess(grams).latent_sd}
+    """The levels as they concern some of the windows, whose ``grams`` these are, and a first guess
+    of others.
+    """
+    guess = _first_guess(grams).latent_sd
+    levels = {key: noise.latent_sd.get(key, level) for key, level in guess.items()}
     return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
 
 
@@ -125,10 +128,7 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of
     like grams, to search from.
     """
-    guess = _first_guess(grams)
-    if start is not None:
-        levels = {key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()}
-        guess = replace(start, latent_sd=levels)
+    guess = only(start, grams, range(len(grams))) if start else _first_guess(grams)
     return maximised(grams, guess, "cpu", ROUGHLY_NATS)
 
 

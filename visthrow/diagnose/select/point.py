@@ -105,26 +105,21 @@ class Problem:
         return self.model.with_laws(laws)
 
     def sizes(self, theta: ndarray) -> dict[str, float]:
-        """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
-        floors.
+        """Sizes of the model's effects in their units, of those that are not 0, as they can have
+        them together; ``theta`` is in floors.
         """
-        return dict(self.model.possible(self._within_bounds(theta)))
-
-    def _within_bounds(self, theta: ndarray) -> dict[str, float]:
         sizes = {}
         for effect, size in zip(self.model.effects, theta):
             if size != 0.0:
                 sizes[effect.name] = float(np.clip(size * effect.floor, *effect.bounds))
-        return sizes
+        return dict(self.model.possible(sizes))
 
     def possible(self, theta: ndarray) -> ndarray:
         """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
-        alone = self._within_bounds(theta)
-        together = self.model.possible(alone)
-        cut = np.zeros(len(theta))
-        for j, effect in enumerate(self.model.effects):
-            cut[j] = together.get(effect.name, 0.0) - alone.get(effect.name, 0.0)
-        return theta + cut / self.priors.floor
+        sizes = self.sizes(theta)
+        together = [sizes.get(effect.name, 0.0) for effect in self.model.effects]
+        count = len(together)
+        return np.append(together / self.priors.floor[:count], theta[count:])
 
 
 @dataclass(frozen=True, eq=False)
