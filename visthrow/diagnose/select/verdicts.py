@@ -326,7 +326,8 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
     """Return by how much each effect of one flight alone differs there from all flights' size."""
-    shares = own_shares(point.plain, point.theta, point.varies) * point.problem.priors.floor
+    shares = own_shares(point.plain, point.theta, point.shares, point.problem.days)
+    shares *= point.problem.priors.floor
     row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
     events = [c for c in chosen if c.group == EVENT]
     return {c.name: float(shares[row[c.flight], c.columns[0]]) for c in events}
