@@ -168,7 +168,7 @@ def _suspected(
     parts = [np.clip(part, -distant, distant) for part in parts]
     square = sum(float((part**2).sum()) for part in parts)
     neighbours = sum(float((part[1:] * part[:-1]).sum()) for part in parts)
-    if neighbours < SUSPECT * square:
+    if neighbours <= SUSPECT * square:  # also where nothing is left
         return None
     return float(np.sqrt(square / len(together)))
 
@@ -184,10 +184,10 @@ def _likeliest(
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
     period = float(np.median(np.concatenate(steps)))
     white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
+    if period > LONGEST:
+        return white[0], 0.0
     none = max(_likelihood(windows, channels, correlations_of, channel, w)[0] for w in white)
     best = -np.inf, white[0]
-    if period > LONGEST:
-        return best[1], 0.0
     levels: noise.Noise | None = None
 
     def shortfall(place: ndarray, order: int) -> float:

@@ -173,10 +173,12 @@ def _following(name: str, measurement: str, curve: np.ndarray, against: float) -
         "nats_against": against,
         "felt_by": measurement,
     }
-    # a controller that answers gusts makes its thrust late for them, but never firmly
-    needed = FIRMLY if peak >= _FOLLOWS else _FOLLOWS
-    if best > max(needed, peak + CLEARLY):
-        delay = _DELAYS[np.argmax(curve)]
+    clearest = _DELAYS[np.argmax(curve)]
+    # A controller that answers gusts makes its thrust seem early, but never firmly; against the
+    # force before it, its thrust is opposed.
+    gusty = clearest > _MOTORS and peak >= _FOLLOWS
+    if best > max(FIRMLY if gusty else _FOLLOWS, peak + CLEARLY):
+        delay = clearest
         way = "late" if delay < _MOTORS else "early"
         text = (
             f"the force follows the thrust by {1e3 * delay:+.0f} ms (correlation {best:.2f}, not"
