@@ -402,6 +402,12 @@ def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     if version not in FORMAT_VERSIONS:
         readable = " and ".join(map(str, FORMAT_VERSIONS))
         raise PolicyError(f"format version {version}; this program reads versions {readable}")
+    estimates = any(name.startswith(ESTIMATOR) for name in arrays)
+    if version != FORMAT_VERSIONS[estimates]:
+        raise PolicyError(
+            f"format version {version}, but {'an' if estimates else 'no'} estimator; expected one"
+            f" in version {FORMAT_VERSIONS[1]} alone"
+        )
     schema = {"activation": str, "contract": dict, "made_by": dict}
     for key, kind in schema.items():
         if not isinstance(header.get(key), kind):

@@ -121,6 +121,8 @@ def rewritten(path, change):
             lambda a, h: h.update(format_version=FORMAT_VERSIONS[-1] + 1),
             "this program reads versions 1 and 2",
         ),
+        (lambda a, h: h.update(format_version=2), "format version 2, but no estimator"),
+        (lambda a, h: a.update(estimator_mean=a["normalizer_mean"]), "1, but an estimator"),
         (lambda a, h: h.pop("contract"), "'contract' is None; expected a dict"),
         (lambda a, h: h.update(activation="relux"), "did you mean 'relu'"),
         (lambda a, h: a.pop("layer1_bias"), "no entry 'layer1_bias'"),
