@@ -13,6 +13,8 @@ from visthrow.logs.unit_names import to_si
 
 _WIDTH = {"quaternion": 4, "euler": 3, "rotvec": 3, "matrix": 9}
 """Kind of an attitude -> number of its columns."""
+_KINDS = (*_WIDTH, "vector")
+_ORDERS = ("xyzw", "wxyz")
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,8 @@ class TimeColumn(Bounded):
 class ChannelMap(Bounded):
     """Columns of one channel.
 
-    Raises ConfigError: a unit, frame, number of columns or order of axes that the channel cannot
-    have.
+    Raises ConfigError: a kind, order, unit, frame, number of columns or order of axes that the
+    channel cannot have.
     """
 
     # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are
@@ -72,6 +74,10 @@ class ChannelMap(Bounded):
         to_si(self.unit, where)
         if not self.columns:
             raise ConfigError(f"{where}: no columns")
+        # a program's own words pass no loader, which would refuse others
+        for what, word, known in (("kind", self.kind, _KINDS), ("order", self.order, _ORDERS)):
+            if word not in known:
+                raise ConfigError(f"{where}: {what} '{word}'; {suggest(word, known)}")
         count = len(self.columns)
         width = _WIDTH.get(self.kind, count)
         if count != width:
@@ -89,11 +95,7 @@ class ChannelMap(Bounded):
             return
         ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
         if ours not in spec.unit.split(", "):
-            kinds = (
-                f"; expected kind, one of {', '.join(_WIDTH)}, vector"
-                if "quat" in self.name
-                else ""
-            )
+            kinds = f"; expected kind, one of {', '.join(_KINDS)}" if "quat" in self.name else ""
             raise ConfigError(
                 f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in"
                 f" '{spec.unit}'{kinds}"

@@ -406,6 +406,8 @@ class TestTables:
             ({"axes": "x,y,-z"}, "mirror the world"),
             ({"axes": "x,x,z"}, "expected x, y and z once each"),
             ({"kind": "quaternion"}, "quaternion of 3 columns"),
+            ({"kind": "quat"}, "kind 'quat'; known: euler"),
+            ({"order": "zyxw"}, "order 'zyxw'; "),
         ],
     )
     def test_bad_mappings(self, change, message):
