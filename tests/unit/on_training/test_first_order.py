@@ -26,8 +26,16 @@ SMALL = [
     "first_order.initial_release=-0.3",
 ]
 LEAST_COSINE = 0.98
-"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
-rates) lets them differ by 0.985.
+"""Between slopes of surrogate and simulator; measured 0.984: the fit leaves a sixth of a step's
+change of the rates.
+"""
+BIAS, REACTING = 0.06, 0.13
+"""Between the sizes of these slopes, as a share: under planned commands, measured 0.05, and of a
+policy that reacts, whose actions add up what the fit leaves in each step, measured 0.12.
+"""
+YAW_RATE = 0.18
+"""Likewise of the last yaw rate, where the motors of a heavy vehicle turn it slowly or a policy
+reacts; measured 0.14 and 0.17.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
@@ -90,10 +98,11 @@ def test_a_release_costs_what_releases_two_steps_about_it_do():
     cost = fo.derivatives()["cost"]
     moving = []
     for step, landing in enumerate(fo.flights.landing):
+        kept = landing.clone()
         landing += 1.0
         if fo.derivatives()["cost"] != cost:
             moving.append(step)
-        landing -= 1.0
+        landing.copy_(kept)
     separation = release + fo.lag
     alone = [separation + node for node in NODES]
     assert moving == [*range(alone[0] - 2, alone[-1] + 3)]
@@ -105,19 +114,22 @@ SLOWER = [
     "rope.payload_mass=0.08",
     "rope.length=0.5",
 ]
+DRAGGED = ["vehicle.aero.drag_x=0.6", "vehicle.aero.drag_y=0.6", "vehicle.aero.drag_z=0.3"]
+"""Ten times the drag, so that the surrogate's shows."""
 
 
 @mark.parametrize(
-    ("vehicle", "reaction", "bias"),
+    ("vehicle", "reaction", "bias", "yaw"),
     [
-        ([], 0.0, 0.06),
-        ([], 2.0, 0.18),
-        (SLOWER, 0.0, 0.06),
-        (["vehicle=vehicle/x500.toml"], 0.0, 0.18),
+        ([], 0.0, BIAS, BIAS),
+        ([], 2.0, REACTING, YAW_RATE),
+        (SLOWER, 0.0, BIAS, BIAS),
+        (DRAGGED, 0.0, BIAS, BIAS),
+        (["vehicle=vehicle/x500.toml"], 0.0, BIAS, YAW_RATE),
     ],
-    ids=["own", "closed loop", "slower", "x500"],
+    ids=["own", "closed loop", "slower", "dragged", "x500"],
 )
-def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, monkeypatch):
+def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, yaw, monkeypatch):
     """How a flight ends, and what is seen of that, against commands at earlier steps, by
     differences of the simulator: of planned commands alone, and of a policy that reacts.
 
@@ -166,11 +178,13 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, monkeypatch)
             pairs[name, axis].append(torch.stack([found[name, axis][k, :, channel], slope]))
     for key, pair in pairs.items():
         surrogate, simulator = torch.cat(pair, dim=1)
-        if simulator.any():
-            size = surrogate.norm() * simulator.norm()
-            assert surrogate @ simulator / size > LEAST_COSINE, key
-            slope = surrogate @ simulator / simulator.square().sum()
-            assert slope == approx(1.0, abs=bias), key
+        if not simulator.any():
+            assert not surrogate.any(), key
+            continue
+        product = surrogate @ simulator
+        assert product / (surrogate.norm() * simulator.norm()) > LEAST_COSINE, key
+        allowed = yaw if key == ("response", 3) else bias
+        assert product / simulator.square().sum() == approx(1.0, abs=allowed), key
 
 
 def test_derivatives_decay_with_each_step():
