@@ -24,8 +24,8 @@ AFTER_LANDING = 10.0
 
 def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ()) -> WirePlant:
     """Call ``module:function`` with policy and seed, and with changes of the policy's configuration
-    where there are any; raises `RunError` where there is none, or one
-    that makes no plant of these two.
+    where there are any; raises `RunError` for a function that does not exist or takes other
+    arguments.
     """
     arguments = (policy, seed, *([changes] if changes else []))
     try:

@@ -1,4 +1,6 @@
-"""Free fall: the closed form; `physics/test_release` holds the simulator to it."""
+"""Free fall: the closed form; `test_team` and `test_reference_plant` of `tests/physics` hold the
+simulators to it.
+"""
 
 import numpy as np
 from numpy.testing import assert_allclose
