@@ -80,7 +80,8 @@ class Types:
             what pushes from outside
             during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
                 mass, ``payload_push_w`` [N]; for laws of a replay the measured
-                ``neighbour_pos_w`` [m], and ``thrust_rate`` [N/s] where commands are thrusts.
+                ``neighbour_pos_w`` [m], and ``thrust_rate`` [N/s] where attitudes are
+                imposed.
         Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
             an entry for one environment or all, and the numerics. rows: types of these arrays.
         Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.

@@ -102,7 +102,7 @@ class Replay:
         download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
         gravity: [m/s^2].
         imposed: whether the recording holds the attitudes that the vehicles take, fields of
-            ``kernel.IMPOSED_FIELDS``; commands then are the motors' thrusts, at once.
+            ``kernel.IMPOSED_FIELDS``; commands then are motor speeds.
     """
 
     def __init__(

@@ -57,7 +57,8 @@ simulator's.
 INEXACT = 0.3
 """Part by which the form of anything may be off: of an effect from flight to flight, of another
 kind of block, of a force against the thrust, of the misfit of a window that begins in a motion that
-nobody knows, of a size that derivatives of elsewhere give.
+nobody knows, of a size that derivatives of elsewhere give, of an effect that another of its group
+would replace.
 """
 
 UNKNOWN_RATIO = 3.0

@@ -17,7 +17,7 @@ MOTORS = ("fl", "fr", "rl", "rr")
 
 @dataclass(frozen=True)
 class CableParams(Bounded):
-    """Payload on a massless cable."""
+    """Payload on a cable without mass: a rod, which also pushes."""
 
     length: Positive  # to the payload's centre [m]
     mass: Positive  # of the payload [kg]

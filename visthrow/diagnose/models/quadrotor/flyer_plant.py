@@ -1,6 +1,6 @@
 """The simulator's plant of a setup's quadrotor, with effects of any size.
 
-A cable is a massless rod on joints: it pulls, and would push."""
+A cable is a massless rod on joints: it pulls, and pushes where a cable would be slack."""
 
 from collections.abc import Mapping
 from functools import cache
