@@ -394,8 +394,8 @@ def sparse(time: np.ndarray) -> bool:
 
 
 def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row | None:
-    """Which exchange of axes level with the rotors an accelerometer has: it feels the little that
-    drag and cable leave there.
+    """Return a row where an accelerometer's x and y fit better exchanged. They feel drag and cable
+    alone; z, which feels the thrust, is left out.
     """
     time = expected_b.time
     known = (time > force_b.time[0] + _SPAN) & (time < force_b.time[-1] - _SPAN)
@@ -408,7 +408,9 @@ def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row
     relation = relations.relate(expected, measured, reach=_DELAY_BAD)
     if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
         return None
-    if relation.correlation > BELONGS:  # other axes would leave none: an attitude that is late
+    # axes that are exchanged do not correlate as they are; where they do, an attitude that is late
+    # lets others fit better
+    if relation.correlation > BELONGS:
         return None
     figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
     return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
