@@ -1,7 +1,8 @@
 """Answer the worlds of banks with two checkouts of the project, and compare the answers.
 
     python -m bench.diagnose.two_checkouts answer --trees OLD NEW --jobs 40 --ledger two.jsonl \\
-        --banks bench/diagnose/bank-open.txt --foreign bench/diagnose/bank-foreign-open.txt
+        --banks bench/diagnose/bank-confirm.txt \\
+        --foreign bench/diagnose/bank-foreign-confirm.txt
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
 With one tree it is answered alone, as the new one.
