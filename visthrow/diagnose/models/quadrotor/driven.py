@@ -81,7 +81,7 @@ class DrivenModel(NumericModel):
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the
         step's own mean: commands switch there."""
         p = self.params
-        step = p.window / steps
+        step = p.step * self.steps / steps
         grid = 0.5 * step * np.arange(2 * steps + 1)[:, None]
         delay = p.command_delay + self.size_of(lanes, "cmd_delay")
         tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
