@@ -371,6 +371,42 @@ class TestFlyer:
             0.5 * np.outer(since**2, expected), abs=3e-4
         )  # the angle squared
 
+    def test_a_neighbour_is_measured_in_the_tilted_frame_too(self):
+        time = np.arange(0.0, 3.0, 0.01)
+        place = np.tile([3.0, 0.0, 2.0], (len(time), 1))
+        log = log_at(time, pos_w=place, quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)))
+        above = Channel(time, place + [0.0, 0.0, 1.0], "m", "world")
+        weight = Channel(time, np.full((len(time), 1), FLYER.mass * G), "N")
+        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0))
+        log = with_channels(log, thrust_command=weight, neighbour_pos_w=above)
+        model = FlyerModel([log], params)
+        lanes = model._lanes(model.size({"frame_tilt_y": 0.05}))
+        (knots, *_) = model.knots(lanes, model.simulate(lanes))
+        begins = knots["pos_w"][0] - knots["neighbour_pos_w"][0]
+        assert begins == approx([-np.sin(0.05), 0.0, -np.cos(0.05)], abs=1e-9)
+
+    @mark.parametrize("step", [0.02, 0.03, 0.06])
+    def test_thrusts_keep_their_time_where_no_number_of_steps_fills_the_window(self, step):
+        time = np.arange(0.0, 4.0, 0.01)
+        log = log_at(
+            time,
+            pos_w=np.tile([0.0, 0.0, 2.0], (len(time), 1)),
+            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
+        )
+        rising = Channel(time, FLYER.mass * G * (1.0 + 0.1 * time[:, None]), "N")
+        params = replace(
+            FLYER,
+            input="thrust_command",
+            thrust_map=(0.0, 1.0, 0.0),
+            motor_time_constant=0.001,
+            step=step,
+        )
+        model = FlyerModel([with_channels(log, thrust_command=rising)], params)
+        driven = model._commands(model._lanes(model.size({})))
+        since = driven["command_time"][0] + 0.5 * model.row
+        held = (driven["command"][0].sum(1) / (FLYER.mass * G) - 1.0) / 0.1
+        assert since - held == approx(0.006, abs=0.0015)  # half a command, and the motors' lag
+
     def test_more_laws_than_the_simulator_holds_are_refused(self):
         law = LawParams("vehicle force", (), "vel", -1e-3)
         with raises(LogError, match="5 laws; expected at most 4"):

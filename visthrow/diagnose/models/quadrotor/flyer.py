@@ -71,6 +71,7 @@ class FlyerModel(DrivenModel):
         """See the base class."""
         flown = self._fly(lanes, keep=True).knots
         cable = self.params.cable
+        level = self._level(lanes)
         listed = []
         for i, stretch in enumerate(self.stretches):
             rows = slice(i * self.knot_count, (i + 1) * self.knot_count)
@@ -78,7 +79,7 @@ class FlyerModel(DrivenModel):
             values["time"] = np.unique(stretch.latent_time)
             if NEIGHBOUR in self.inputs:
                 at_knots = np.linspace(0, self.rows, self.knot_count).round().astype(int)
-                values[NEIGHBOUR] = stretch.data[NEIGHBOUR][at_knots]
+                values[NEIGHBOUR] = rotate(level[i], stretch.data[NEIGHBOUR][at_knots])
             if cable is None:
                 for name in ("payload_pos_w", "payload_vel_w", "tension"):
                     del values[name]
@@ -189,7 +190,8 @@ class FlyerModel(DrivenModel):
             acc = 0.0 * acc
         neighbour = np.zeros_like(acc)
         if NEIGHBOUR in self.inputs:
-            neighbour = self.of_windows(lanes, NEIGHBOUR)[:, : self.rows]
+            measured = self.of_windows(lanes, NEIGHBOUR)[:, : self.rows]
+            neighbour = rotate(self._level(lanes)[:, None], measured)
         return {
             "attitude": quat[:, :-1],
             "rate_b": rate[:, :-1],  # where no torque is simulated
