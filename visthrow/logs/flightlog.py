@@ -176,13 +176,15 @@ class FlightLog:
 
     def samples(self, name: str, fewest: int = 50) -> Samples | None:
         """Return the valid samples of a channel; None where the log holds fewer."""
-        if name not in self or np.sum(self[name].valid) < fewest:
+        if name not in self:
             return None
-        return self[name].samples()
+        samples = self[name].samples()
+        return samples if len(samples.time) >= fewest else None
 
     def notes(self, name: str) -> dict[str, Any]:
         """Return the reader's notes on a channel."""
-        return self.meta.get("ingest", {}).get(name, {})
+        notes: dict[str, Any] = self.meta.get("ingest", {}).get(name, {})
+        return notes
 
     def measured(self) -> "FlightLog":
         """Return the log without the channels that were worked out of others:
