@@ -225,10 +225,10 @@ class Trainer:
             saved = torch.load(path, map_location=self.device, weights_only=True)
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
-        there = saved["config"] + f"seed = {saved['seed']}\n"
-        here = config.dumps(self.experiment) + f"seed = {self.seed}\n"
-        if there != here:
-            differ = sorted(set(there.splitlines()) ^ set(here.splitlines()))
+        written = saved["config"] + f"seed = {saved['seed']}\n"
+        expected = config.dumps(self.experiment) + f"seed = {self.seed}\n"
+        if written != expected:
+            differ = sorted(set(written.splitlines()) ^ set(expected.splitlines()))
             raise CheckpointError(
                 f"{path}: written by a run of another configuration or seed, or by another version"
                 f" of visthrow; lines that differ: {'; '.join(differ)}"

@@ -16,9 +16,9 @@ from hil.links.backends.base import (
     LAND,
     WAIT,
     Autopilot,
+    BackendParams,
     Command,
     Release,
-    VehicleParams,
 )
 from hil.links.mavlink_link import Link, attitude_target, command_long, parameter_request
 from hil.links.pymav import mav
@@ -54,7 +54,7 @@ CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
 @dataclass(frozen=True)
-class AutopilotParams(VehicleParams):
+class AutopilotParams(BackendParams):
     """A vehicle that speaks MAVLink."""
 
     system: MavlinkId  # MAVLink id of the vehicle

@@ -51,8 +51,8 @@ class Status:
 
 
 @dataclass(frozen=True)
-class VehicleParams(Bounded):
-    """What every vehicle on the other side has."""
+class BackendParams(Bounded):
+    """Settings that every vehicle on the other side has."""
 
     thrust: HoverThrustParams
     mechanism_lag: NotNegative  # from the release command to separation [s]
@@ -60,7 +60,7 @@ class VehicleParams(Bounded):
 
 
 @dataclass(frozen=True)
-class PortVehicleParams(VehicleParams):
+class PortVehicleParams(BackendParams):
     """A vehicle on a port of its own."""
 
     device: str  # see hil.links.device
@@ -256,7 +256,7 @@ class Autopilot(Backend):
 
     audit = Audit()
     release_record: Release
-    params: VehicleParams
+    params: BackendParams
     share: float | None = None
     voltage: float | None = None
     rates: tuple[float, ...] | None = None

@@ -63,9 +63,9 @@ class FlyerModel(DrivenModel):
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
         poses = 2 * np.count_nonzero(stretch.channel == 0) // 3
-        rest = np.count_nonzero(stretch.channel) // 3
-        seen = np.concatenate([path[:, :poses:2], path[:, poses : poses + rest]], axis=1)
-        return seen.reshape(len(path), -1)
+        others_end = poses + np.count_nonzero(stretch.channel) // 3
+        samples = np.concatenate([path[:, :poses:2], path[:, poses:others_end]], axis=1)
+        return samples.reshape(len(path), -1)
 
     def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
         """See the base class."""
@@ -102,12 +102,12 @@ class FlyerModel(DrivenModel):
         inputs = without_each(stretch.data["sent"], self.params, stretch.data["start"])
         model = copy(self)
         model.stretches = [stretch]
-        for held in inputs:
-            model.stretches.append(replace(stretch, data={**stretch.data, "sent": held}))
+        for commands in inputs:
+            model.stretches.append(replace(stretch, data={**stretch.data, "sent": commands}))
         start = np.tile(self._start[i], (len(model.stretches), 1))
         lanes = model._lanes(size, start)
-        seen = self.measure(stretch, model.simulate(lanes), lanes)
-        return (seen[1:] - seen[:1]).T
+        samples = self.measure(stretch, model.simulate(lanes), lanes)
+        return (samples[1:] - samples[:1]).T
 
     def _fly(self, lanes: Lanes, keep: bool = False) -> Any:
         """Replay lanes (``sim.kernels.replay.lanes.Replayed``).
@@ -222,24 +222,25 @@ class FlyerModel(DrivenModel):
             "command_first": first,
             "command_last": first + self.rows,
         }
-        for sensor, stamps in self._seen().items():
+        for sensor, stamps in self._shown_stamps().items():
             counts = np.array([len(time) for time in stamps])
             fields[f"{sensor}_count"] = counts[flights.owner]
             fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[flights.owner]
         return {name: np.broadcast_to(value, count) for name, value in fields.items()}
 
-    def _seen(self) -> dict[str, list[ndarray]]:
+    def _shown_stamps(self) -> dict[str, list[ndarray]]:
         """Return the stamps of what each sensor shows of each stretch [s]."""
         channels = {"vehicle": self.params.position, "payload": "payload_pos_w", "gyro": "rate_b"}
-        seen = {}
+        stamps = {}
         for sensor, name in channels.items():
             number = self.channels.index(name) if name in self.channels else -1
-            seen[sensor] = [s.time[s.channel == number][::3] for s in self.stretches]
-        return seen
+            stamps[sensor] = [s.time[s.channel == number][::3] for s in self.stretches]
+        return stamps
 
     def _stamps(self) -> dict[str, ndarray]:
         """Return the stamps of all stretches as a replay reads them."""
-        stamps = {f"{name}_time": np.concatenate(times) for name, times in self._seen().items()}
+        shown = self._shown_stamps()
+        stamps = {f"{name}_time": np.concatenate(times) for name, times in shown.items()}
         level = np.array([0.0, 0.0, 0.0, 1.0])  # attitudes seen are not looked at
         return stamps | {"vehicle_quat": np.tile(level, (len(stamps["vehicle_time"]), 1))}
 

@@ -20,7 +20,7 @@ ARM = 1e-3  # of rotors whose torques are not simulated [m]
 # radius of gyration of a vehicle that nothing turns but its measured attitude [m]
 UNTURNED = 100.0
 ALMOST_NONE = 1e-9  # of what may not be without any
-ENOUGH = 1e3  # weights that motors lift: no thrust is limited
+AMPLE_LIFT = 1e3  # weights that motors lift: no thrust is limited
 NO_CABLE = CableParams(1.0, 1.0)  # which no window flies
 
 
@@ -32,7 +32,7 @@ def _known_plant() -> PlantParams:
 
 def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantParams:
     """Return the plant of a setup as it stands, whose commands are the motors' thrusts at once."""
-    known = _known_plant()
+    base = _known_plant()
     torque = params.torque or TorqueParams(
         (params.mass * UNTURNED**2,) * 3, ARM, ARM, ALMOST_NONE, (1.0, -1.0, -1.0, 1.0)
     )
@@ -46,7 +46,7 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         "battery.kind": "ideal",
         "body.inertia": torque.inertia,
         "body.mass": params.mass,
-        "controller.max_thrust": ENOUGH * params.mass * params.gravity,
+        "controller.max_thrust": AMPLE_LIFT * params.mass * params.gravity,
         "motor.kind": "instant",
         "queue.delay": 0.0,
         "rotors.inertia": 0.0,
@@ -72,7 +72,7 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         joint_damping=0.0,
         mount=cable.mount,
     )
-    return PlantParams(changed(known.vehicle, values), rope, known.release, known.sim, laws=laws)
+    return PlantParams(changed(base.vehicle, values), rope, base.release, base.sim, laws=laws)
 
 
 @cache
