@@ -32,7 +32,7 @@ class Told:
 
     def __init__(self, way: str, state: str, parts, monkeypatch):
         self.runner, source, self.clock, self.fake = parts
-        self.way, self.state, self.done_at, self.ticks = way, state, None, 0
+        self.way, self.state, self.done_at, self.ticks, self.heights = way, state, None, 0, {}
         monkeypatch.setattr("sys.stdin", None)
         self.saved = {number: signal.getsignal(number) for number in ENDING}
         operator = Terminal(True, lambda: True, lambda text: None)
@@ -62,6 +62,7 @@ class Told:
                 signal.signal(number, handler)
 
     def tell(self, decision):
+        self.heights.setdefault(decision.state, self.fake.plant.state["pos_w"][2])
         if self.way == "output raises" and decision.state == self.state:
             raise BrokenPipeError("nobody reads")
 
