@@ -91,13 +91,13 @@ def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | 
     v = next(v for v in random_effects() if v.name == NAME)
     problem = point.problem
     priors = problem.priors
-    sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
     graded = priors.visible & ~problem.switches
     sets = active, np.flatnonzero(graded[: len(problem.model.effects)]).tolist()
     numbers = range(len(problem.kept))
     for rows, shares in ((few_of(numbers), reach[::COARSE]), (numbers, reach)):
-        columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
+        chosen = [problem.kept[w] for w in rows]
+        columns = problem.model.without_commands(point.about.theta, chosen)
         if not columns:
             return None
         windows = [point.windows[w] for w in rows]

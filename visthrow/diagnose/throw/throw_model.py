@@ -271,14 +271,11 @@ class ThrowModel(Model):
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """See the base class; the command before stays."""
-        setting = self.at(theta)
-        states = self._settled_at.get(_key(theta))
-        if states is None:
-            states = self._settled(setting)
+        states = self._settled_at[_key(theta)]
         delay = self.setting.plant.vehicle.queue.delay
-        return without_each_command(
-            self.flights, self._retained[list(windows)], delay, self.simulation(setting), states
-        )
+        simulation = self.simulation(self.at(theta))
+        numbers = self._retained[list(windows)]
+        return without_each_command(self.flights, numbers, delay, simulation, states)
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
