@@ -9,7 +9,6 @@ other half, ``bank-confirm.txt``, is for the values that were chosen.
 
 import argparse
 import json
-import multiprocessing as mp
 import shutil
 import tempfile
 import time
@@ -17,7 +16,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from bench.diagnose import sealed, two_checkouts
+from bench.diagnose import two_checkouts
 
 ROOT = Path(__file__).parents[2]
 BANK = ROOT / "bench/diagnose/bank-fix.txt"
@@ -33,7 +32,7 @@ VALUES = {
 LAST = 60.0  # no world begins in the last seconds
 
 
-def plant_trees(folder: Path) -> dict[str, Path]:
+def copy_trees(folder: Path) -> dict[str, Path]:
     """Copy the project once for each value; return the copies by what was changed."""
     trees = {BASE: ROOT}
     for statement, values in VALUES.items():
@@ -52,7 +51,7 @@ def plant_trees(folder: Path) -> dict[str, Path]:
     return trees
 
 
-def one(task: tuple) -> dict | None:
+def answer_one(task: tuple) -> dict | None:
     """Answer one world with one copy; None where the time is over."""
     world, variant, tree, begin_until, until = task
     line = two_checkouts.one((world, [str(tree)], begin_until, until))
@@ -63,19 +62,11 @@ def answer(args: argparse.Namespace) -> None:
     """Answer the bank with all copies, world after world."""
     worlds = two_checkouts.worlds_of([str(BANK)], [])
     until = time.time() + args.seconds
-    context = mp.get_context("spawn")
     with tempfile.TemporaryDirectory() as name:
-        trees = plant_trees(Path(name))
+        trees = copy_trees(Path(name))
         tasks = [(w, *item, until - LAST, until) for w in worlds for item in trees.items()]
         print(f"{len(worlds)} worlds, {len(trees)} answers each", flush=True)
-        with (
-            context.Pool(args.jobs, sealed._alone, (context.Value("i", 0),)) as pool,
-            args.ledger.open("a") as ledger,
-        ):
-            for line in pool.imap_unordered(one, tasks):
-                if line is not None:
-                    ledger.write(json.dumps(line) + "\n")
-                    ledger.flush()
+        two_checkouts.write_answers(answer_one, tasks, args.jobs, args.ledger)
 
 
 def right(line: dict) -> bool:
@@ -100,6 +91,8 @@ def compare(args: argparse.Namespace) -> None:
             print(f"not flown: {line}")
         else:
             answers[line["variant"]][line["kind"], line["recipe"]["seed"]] = line
+    if BASE not in answers:
+        raise SystemExit(f"{args.ledger} holds no answer with the constants as they are")
     worlds = set.intersection(*(set(lines) for lines in answers.values()))
     print(f"{len(worlds)} worlds answered by all")
     for variant, lines in answers.items():

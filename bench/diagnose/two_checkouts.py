@@ -214,12 +214,19 @@ def answer(args: argparse.Namespace) -> None:
     trees = [str(Path(tree).resolve()) for tree in args.trees]
     tasks = [(world, trees, *limits) for world in worlds]
     print(f"{len(worlds)} worlds", flush=True)
+    write_answers(one, tasks, args.jobs, args.ledger)
+
+
+def write_answers(
+    answer_one: Callable[[tuple], dict | None], tasks: Iterable[tuple], jobs: int, path: Path
+) -> None:
+    """Do tasks in processes with a core each; append the answers to a ledger as they come."""
     context = mp.get_context("spawn")
     with (
-        context.Pool(args.jobs, sealed._alone, (context.Value("i", 0),)) as pool,
-        args.ledger.open("a") as ledger,
+        context.Pool(jobs, sealed._alone, (context.Value("i", 0),)) as pool,
+        path.open("a") as ledger,
     ):
-        for line in pool.imap_unordered(one, tasks):
+        for line in pool.imap_unordered(answer_one, tasks):
             if line is not None:
                 ledger.write(json.dumps(line) + "\n")
                 ledger.flush()

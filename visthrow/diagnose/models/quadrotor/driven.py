@@ -57,7 +57,7 @@ class DrivenModel(NumericModel):
     def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
         """See the base class; at most ``most_windows``, spread evenly.
 
-        Raises LogError: commands are of another size than carries the vehicle.
+        Raises LogError: the commands' thrust is not that which carries the vehicle.
         """
         stretches = super().cut(logs)
         limit = self.params.most_windows

@@ -57,7 +57,7 @@ class FlyerModel(DrivenModel):
         return windows_of(self, log, number)
 
     def simulate(self, lanes: Lanes) -> ndarray:
-        """See the base class; what is seen of each lane, as a replay has it."""
+        """See the base class; samples in the order of the replay's sensors."""
         return self._fly(lanes).seen.swapaxes(0, 1)
 
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
@@ -152,7 +152,9 @@ class FlyerModel(DrivenModel):
         )
 
     def _commands(self, lanes: Lanes) -> dict[str, ndarray]:
-        """Return what the motors do in each row of lanes' flights, shape (B, rows, ...)."""
+        """Return the time, each motor's thrust and the slope of their sum in each row of lanes'
+        flights, shape (B, rows, ...).
+        """
         thrusts = self.thrusts(lanes, self.rows)
         ends = thrusts[::2]
         means = (ends[:-1] + 4.0 * thrusts[1::2] + ends[1:]) / 6.0
@@ -183,15 +185,15 @@ class FlyerModel(DrivenModel):
         quat /= np.linalg.norm(quat, axis=2, keepdims=True)
         turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")[:, None]
         turn = turn + self.size_of(lanes, "estimator_lean")[:, None, None] * lean
-        quat = _product(self._level(lanes)[:, None], _product(quat, quat_of_vector(turn)))
+        level = self._level(lanes)[:, None]
+        quat = _product(level, _product(quat, quat_of_vector(turn)))
         turned = vectors_between(quat[:, :-1].reshape(-1, 4), quat[:, 1:].reshape(-1, 4))
         acc = np.diff(rate, axis=1) / self.row
         if self.params.torque is not None:  # which turns the vehicle
             acc = 0.0 * acc
         neighbour = np.zeros_like(acc)
         if NEIGHBOUR in self.inputs:
-            measured = self.of_windows(lanes, NEIGHBOUR)[:, : self.rows]
-            neighbour = rotate(self._level(lanes)[:, None], measured)
+            neighbour = rotate(level, self.of_windows(lanes, NEIGHBOUR)[:, : self.rows])
         return {
             "attitude": quat[:, :-1],
             "rate_b": rate[:, :-1],  # where no torque is simulated
@@ -241,8 +243,8 @@ class FlyerModel(DrivenModel):
         """Return the stamps of all stretches as a replay reads them."""
         shown = self._shown_stamps()
         stamps = {f"{name}_time": np.concatenate(times) for name, times in shown.items()}
-        level = np.array([0.0, 0.0, 0.0, 1.0])  # attitudes seen are not looked at
-        return stamps | {"vehicle_quat": np.tile(level, (len(stamps["vehicle_time"]), 1))}
+        unused = np.array([0.0, 0.0, 0.0, 1.0])  # attitudes are imposed, not compared
+        return stamps | {"vehicle_quat": np.tile(unused, (len(stamps["vehicle_time"]), 1))}
 
     def _begin(self, lanes: Lanes, begun: Mapping[str, ndarray]) -> dict[str, ndarray]:
         """Return initial states of a replay from the unknowns at the windows' start.

@@ -17,11 +17,11 @@ from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerPa
 from visthrow.task import load_experiment, plant_of
 
 ARM = 1e-3  # of rotors whose torques are not simulated [m]
-# radius of gyration of a vehicle that nothing turns but its measured attitude [m]
+# radius of gyration where the measured attitude alone turns the vehicle [m]
 UNTURNED = 100.0
-ALMOST_NONE = 1e-9  # of what may not be without any
+ALMOST_NONE = 1e-9  # in place of 0, where the simulator needs a positive number
 AMPLE_LIFT = 1e3  # weights that motors lift: no thrust is limited
-NO_CABLE = CableParams(1.0, 1.0)  # which no window flies
+NO_CABLE = CableParams(1.0, 1.0)  # of a vehicle whose windows have no payload
 
 
 @cache
