@@ -27,7 +27,7 @@ from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from visthrow.diagnose.likelihood import noise_levels as noise
-from visthrow.diagnose.likelihood.evidence import VERY_STRONG
+from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG
 from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram, residual_after_fit
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Window
@@ -188,22 +188,25 @@ def _likeliest(
         return white[0], 0.0
     none = max(_likelihood(windows, channels, correlations_of, channel, w)[0] for w in white)
     best = -np.inf, white[0]
+    longer = -np.inf
     levels: noise.Noise | None = None
 
     def shortfall(place: ndarray, order: int) -> float:
-        nonlocal best, levels
+        nonlocal best, longer, levels
         guess = Correlation(period * np.exp(place[0]), float(expit(place[1])), order, scale)
         value, levels = _likelihood(windows, channels, correlations_of, channel, guess, levels)
-        if value > best[0]:
+        if guess.time > LONGEST:
+            longer = max(longer, value)
+        elif value > best[0]:
             best = value, replace(guess, scale=scale * levels.scale[channel])
         return -value
 
-    bounds = [(0.0, np.log(LONGEST / period)), logit(SHARES)]
+    bounds = [(0.0, np.log(2.0 * LONGEST / period)), logit(SHARES)]
     order = min((1, 2), key=lambda order: shortfall(START[0], order))
     options = {"initial_simplex": START, "xatol": np.inf, "fatol": noise.ENOUGH_NATS}
     minimize(shortfall, START[0], (order,), "Nelder-Mead", bounds=bounds, options=options)
     value, likeliest = best
-    lasts = likeliest.time > 0.9 * LONGEST  # it would last for still longer
+    lasts = longer > value + STRONG
     return likeliest, 0.0 if lasts else value - none
 
 
