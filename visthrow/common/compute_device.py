@@ -8,13 +8,17 @@ from visthrow.common.errors import DeviceError
 
 def resolve(name: str = "auto") -> str:
     """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu``
-    or ``cuda:<i>``.
+    or ``cuda:<i>``, a device that both Warp and torch can use.
 
     Raises DeviceError if there is no such device.
     """
-    import torch
+    import warp as wp
 
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    count = wp.get_cuda_device_count()
+    if count:  # torch takes seconds to load, and has nothing to say without a GPU
+        import torch
+
+        count = torch.cuda.device_count()
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
     device = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
     if device not in exists:

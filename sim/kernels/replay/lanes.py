@@ -3,7 +3,7 @@ cores of a CPU.
 """
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +99,6 @@ class Replay:
         sensings: of the same rows.
         device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the
             same.
-        download: brings what the lanes saw to the host, hundreds of megabytes after a run of many.
         gravity: [m/s^2].
         imposed: whether the recording holds the attitudes that the vehicles take, fields of
             ``kernel.IMPOSED_FIELDS``; commands then are motor speeds.
@@ -110,7 +109,6 @@ class Replay:
         plants: Sequence[PlantParams],
         sensings: Sequence[SensingParams],
         device: str = "cpu",
-        download: Callable[[wp.array], ndarray] = wp.array.numpy,
         gravity: float = GRAVITY,
         imposed: bool = False,
     ):
@@ -125,7 +123,6 @@ class Replay:
         self.device = device
         self.segments = first.rope.segments
         self._sim = first.sim
-        self._download = download
         self._gravity = gravity
         self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
         check_laws(first.laws, measured=imposed)
@@ -219,8 +216,8 @@ class Replay:
             self._launch(device, first, costs[rows], before, after)
             first += len(rows)
         if not keeps:
-            return Replayed(self._download(out), {}, {})
-        return Replayed(self._download(out), _read(ends, k.State), _read(knot_states, k.Knots))
+            return Replayed(out.numpy(), {}, {})
+        return Replayed(out.numpy(), _read(ends, k.State), _read(knot_states, k.Knots))
 
     def _launch(self, device: str, begin: int, costs: ndarray, before: list, after: list) -> None:
         """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread

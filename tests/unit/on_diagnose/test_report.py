@@ -83,6 +83,14 @@ def measured(found):
     return gain.measure(found[1])
 
 
+def test_flights_without_a_landing_that_was_seen_have_no_gain_in_landings(found, monkeypatch):
+    model, diagnosis = found
+    points = np.empty((0, 3))
+    nothing = PredictedLandings(np.empty(0, int), points, points, points)
+    monkeypatch.setattr(model, "landings", lambda theta, flights: nothing)
+    assert gain.measure(diagnosis).landing is None
+
+
 def test_prediction_does_not_look_at_what_it_predicts(found):
     _, diagnosis = found
     point = diagnosis.work.after

@@ -123,7 +123,7 @@ def correlations(
     model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = parallel_map(partial(hidden_gram, channels=channels), free)
-    fits = noise.widely_fitted(free, bare, "cpu")
+    fits = noise.widely_fitted(free, bare)
     residuals = parallel_map(residual_after_fit, free, fits)
     correlations_of: dict[int, Correlation] = {}
     for channel in range(channels):

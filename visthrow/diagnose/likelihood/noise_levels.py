@@ -72,7 +72,6 @@ def fit(
     windows: Sequence[Window],
     grams: Sequence[Gram],
     start: Noise | None = None,
-    device: str = "cpu",
 ) -> tuple[Noise, list[Gram]]:
     """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
 
@@ -83,14 +82,14 @@ def fit(
     noise = start
     time = CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):
-        noise = _likeliest(windows, grams, device)
+        noise = _likeliest(windows, grams)
         time = noise.correlation_time
     shaped = correlated_of(grams, windows, time)
     begin = replace(noise or _first_guess(shaped), correlation_time=time)
-    return maximised(shaped, begin, device)[0], shaped
+    return maximised(shaped, begin)[0], shaped
 
 
-def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) -> Noise:
+def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
     """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
     has one maximum over it.
     """
@@ -101,7 +100,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
         if i not in levels_of:
             shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
             begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
-            levels_of[i] = maximised(shaped, begin, device, ROUGHLY_NATS)
+            levels_of[i] = maximised(shaped, begin, ROUGHLY_NATS)
         return levels_of[i][1]
 
     best = len(CORRELATION_TIMES) // 2
@@ -129,7 +128,7 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     like grams, to search from.
     """
     guess = only(start, grams, range(len(grams))) if start else _first_guess(grams)
-    return maximised(grams, guess, "cpu", ROUGHLY_NATS)
+    return maximised(grams, guess, ROUGHLY_NATS)
 
 
 def _first_guess(grams: Sequence[Gram]) -> Noise:
@@ -211,7 +210,7 @@ class _Layout:
 
 
 def maximised(
-    grams: Sequence[Gram], noise: Noise, device: str, tolerance: float = ENOUGH_NATS
+    grams: Sequence[Gram], noise: Noise, tolerance: float = ENOUGH_NATS
 ) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
@@ -219,7 +218,7 @@ def maximised(
     all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
     promises less is the last."""
     layout = _Layout.numbered(grams, noise)
-    stack = Stack(grams, device)
+    stack = Stack(grams)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 
@@ -304,9 +303,7 @@ def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, nda
     return noise.log_prior + float(values.sum()), slope, curvature
 
 
-def without_outliers(
-    windows: Sequence[Window], grams: Sequence[Gram], device: str = "cpu"
-) -> list[Window]:
+def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are
     returned as they are.
 
@@ -316,9 +313,8 @@ def without_outliers(
     windows_left = list(range(len(windows)))
     starts = list(windows)
     bare = [without_effects(gram) for gram in grams]
-    for cleaning in range(CLEANINGS):
-        where = "cpu" if cleaning else device  # few are looked at once more
-        fits = widely_fitted(starts, bare, where)
+    for _ in range(CLEANINGS):
+        fits = widely_fitted(starts, bare)
         residuals = parallel_map(residual_after_fit, starts, fits)
         looked_at = windows_left
         windows_left = []
@@ -334,7 +330,7 @@ def without_outliers(
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 
-def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[ndarray]:
+def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarray]:
     """Initial states in prior deviations and latents at the knots that explain most, with wide
     priors of the latents.
     """
@@ -346,7 +342,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
-    fits, _ = Stack(shaped, device).fitted(noise)
+    fits, _ = Stack(shaped).fitted(noise)
     for fit, gram in zip(fits, shaped):
         latents = fit[gram.nuisances :]
         fit[gram.nuisances :] = gram.factor @ latents

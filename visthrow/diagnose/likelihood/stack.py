@@ -1,16 +1,15 @@
-"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores or
-where the simulation runs.
+"""Windows side by side: what noise levels are worth in all of them at once, on the CPU's cores.
 
 The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one
-size: on a GPU in one batch, on a CPU in batches that fit its cache."""
+size, in batches that fit a core's cache."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-import torch
 from numpy import ndarray
+from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.marginal import (
@@ -20,7 +19,6 @@ from visthrow.diagnose.likelihood.marginal import (
     without_rounding,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 T = TypeVar("T")
@@ -29,7 +27,7 @@ T = TypeVar("T")
 # rounding
 ROUNDING = 1e-10
 
-BATCH = 8  # windows of a batch on the CPU
+BATCH = 8  # windows of a batch
 BLOCKS = len(LATENT_BLOCKS)
 
 
@@ -39,53 +37,50 @@ class _Batch:
 
     windows: ndarray  # rows of the noise's shares, shape (W,)
     grams: list[Gram]
-    hidden: torch.Tensor  # inner products of the columns, shape (W, C, n, n)
-    cross: torch.Tensor  # shape (W, C, n)
-    square: torch.Tensor  # shape (W, C)
-    count: torch.Tensor  # shape (W, C)
-    log_sigma: torch.Tensor  # shape (W,)
-    member: torch.Tensor  # 1 where a column is of a block, shape (W, n, B)
-    initial: torch.Tensor  # 1 where it is one of the initial state, shape (W, n)
+    hidden: ndarray  # inner products of the columns, shape (W, C, n, n)
+    cross: ndarray  # shape (W, C, n)
+    square: ndarray  # shape (W, C)
+    count: ndarray  # shape (W, C)
+    log_sigma: ndarray  # shape (W,)
+    member: ndarray  # 1 where a column is of a block, shape (W, n, B)
+    initial: ndarray  # 1 where it is one of the initial state, shape (W, n)
 
 
 @dataclass(frozen=True)
 class _Shape:
     """A batch at some noise levels, whatever its residuals are."""
 
-    weight: torch.Tensor  # of the channels, shape (C,)
-    level: torch.Tensor  # prior deviation of the columns, shape (W, n)
-    factor: torch.Tensor  # lower Cholesky factor of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
-    log_det: torch.Tensor  # of V, shape (W,)
+    weight: ndarray  # of the channels, shape (C,)
+    level: ndarray  # prior deviation of the columns, shape (W, n)
+    # inverse of the lower Cholesky factor L of 1 + P^1/2 U' W U P^1/2, shape (W, n, n)
+    root: ndarray
+    log_det: ndarray  # of V, shape (W,)
 
 
-def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Integrals":
+def integrals(grams: Sequence[Gram], noise: Noise) -> "Integrals":
     """Integrate initial states and latent forces out of windows.
 
     Raises DiagnoseError: as :meth:`Stack.fitted`; information came out negative beyond rounding.
     """
-    return Integrals(Stack(grams, device), grams, noise)
+    return Integrals(Stack(grams), grams, noise)
 
 
 class Stack:
     """Some windows' inner products of initial states and latent forces."""
 
-    def __init__(
-        self, grams: Sequence[Gram], device: str = "cpu", windows: Sequence[int] | None = None
-    ):
-        """Pad and move.
+    def __init__(self, grams: Sequence[Gram], windows: Sequence[int] | None = None):
+        """Pad the windows to one size.
 
         ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of
         the noise's shares; default: their order."""
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
-        self.device = device
-        size = BATCH if device == "cpu" else max(len(grams), 1)
         self._sizes = [gram.hidden for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
-        self.order = [order[first : first + size] for first in range(0, len(order), size)]
+        self.order = [order[first : first + BATCH] for first in range(0, len(order), BATCH)]
         parts = [[grams[w] for w in members] for members in self.order]
-        self.batches = parallel_map(self._padded, parts, [rows[m] for m in self.order])
+        self.batches = parallel_map(self._batch, parts, [rows[m] for m in self.order])
 
-    def _padded(self, grams: list[Gram], windows: ndarray) -> _Batch:
+    def _batch(self, grams: list[Gram], windows: ndarray) -> _Batch:
         count = len(grams)
         n = max(gram.hidden for gram in grams)
         member = np.zeros((count, n, BLOCKS))
@@ -97,11 +92,9 @@ class Stack:
         cross, _, square = _residual_products(grams, n, 0)
         counts = np.stack([gram.count for gram in grams])
         log_sigma = np.array([gram.log_sigma for gram in grams])
-        arrays = cross, square, counts, log_sigma, member, initial
-        tensors = [torch.from_numpy(array).to(self.device) for array in arrays]
         parts = [gram.inner[:, : gram.hidden, : gram.hidden] for gram in grams]
-        hidden = side_by_side(parts, (counts.shape[1], n, n), self.device)
-        return _Batch(windows, grams, hidden, *tensors)
+        hidden = _padded(parts, (counts.shape[1], n, n))
+        return _Batch(windows, grams, hidden, cross, square, counts, log_sigma, member, initial)
 
     def fitted(self, noise: Noise) -> tuple[list[ndarray], ndarray]:
         """Most probable initial state and unit latent forces of each window, shape (D + L,), and
@@ -110,7 +103,7 @@ class Stack:
         Raises DiagnoseError: the normal equations are not positive definite, which only broken
         derivatives can cause."""
 
-        def fit(batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
+        def fit(batch: _Batch) -> tuple[ndarray, ndarray]:
             shape = _shape(batch, noise)
             mean, value = _solved(shape, batch)
             return shape.level * mean, value
@@ -129,7 +122,15 @@ class Stack:
         return tuple(np.array(_by_window(self.order, column)) for column in zip(*parts))
 
     def _of_batches(self, function) -> list[tuple[ndarray, ...]]:
-        return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self.batches)
+        return parallel_map(function, self.batches)
+
+
+def _padded(parts: Sequence[ndarray], shape: tuple[int, ...]) -> ndarray:
+    """Arrays one beside the other, each padded with zeros to one shape; shape (arrays, *shape)."""
+    out = np.zeros((len(parts), *shape))
+    for row, part in zip(out, parts):
+        row[tuple(map(slice, part.shape))] = part
+    return out
 
 
 def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> list[T]:
@@ -149,89 +150,94 @@ def _levels(batch: _Batch, noise: Noise) -> ndarray:
 
 
 def _shape(batch: _Batch, noise: Noise) -> _Shape:
-    by_block = batch.square.new_tensor(_levels(batch, noise))
-    latent_level = batch.member @ by_block[:, :, None]
+    latent_level = batch.member @ _levels(batch, noise)[:, :, None]
     level = batch.initial + latent_level[..., 0]
-    scale = batch.square.new_tensor(noise.scale)
-    weight = scale**-2.0
+    weight = noise.scale**-2.0
     normal = _weighed(weight, batch.hidden)
     normal *= level[:, :, None]
     normal *= level[:, None]
-    normal.diagonal(dim1=1, dim2=2).add_(1.0)
-    factor, failed = torch.linalg.cholesky_ex(normal)
-    if torch.any(failed):
-        # Levels of many orders of magnitude, as a search for them may try, leave the identity below
-        # rounding.
-        normal.diagonal(dim1=1, dim2=2).mul_(1.0 + ROUNDING * (failed[:, None] > 0))
-        factor, failed = torch.linalg.cholesky_ex(normal)
-        if torch.any(failed):
-            gram = batch.grams[int(torch.nonzero(failed)[0, 0])]
-            where = f"window of flight {gram.flight}, phase {gram.phase}"
-            raise DiagnoseError(f"{where}: the normal equations are singular")
-    log_diagonal = factor.diagonal(dim1=1, dim2=2).log().sum(-1)
-    log_det = 2.0 * (log_diagonal + batch.log_sigma + batch.count @ scale.log())
-    return _Shape(weight, level, factor, log_det)
+    _diagonal(normal)[:] += 1.0
+    factor = _factors(normal, batch.grams)
+    log_diagonal = np.log(_diagonal(factor)).sum(-1)
+    log_det = 2.0 * (log_diagonal + batch.log_sigma + batch.count @ np.log(noise.scale))
+    root = np.stack([lapack.dtrtri(one, lower=1)[0] for one in factor])
+    return _Shape(weight, level, root, log_det)
 
 
-def _solved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
+def _diagonal(matrices: ndarray) -> ndarray:
+    """Return a view of the diagonals of matrices, shape (W, n)."""
+    return np.einsum("wii->wi", matrices)
+
+
+def _factors(normal: ndarray, grams: Sequence[Gram]) -> ndarray:
+    """Return the lower Cholesky factors of windows' normal equations, shape (W, n, n)."""
+    try:
+        return np.linalg.cholesky(normal)
+    except np.linalg.LinAlgError:
+        return np.stack([_factor(one, gram) for one, gram in zip(normal, grams)])
+
+
+def _factor(normal: ndarray, gram: Gram) -> ndarray:
+    """Return the lower Cholesky factor of a window's normal equations.
+
+    Levels of many orders of magnitude, as a search for them may try, leave the identity below
+    rounding: then the diagonal grows a little."""
+    for growth in (0.0, ROUNDING):
+        try:
+            return np.linalg.cholesky(normal + growth * np.diag(np.diag(normal)))
+        except np.linalg.LinAlgError:
+            continue
+    where = f"window of flight {gram.flight}, phase {gram.phase}"
+    raise DiagnoseError(f"{where}: the normal equations are singular")
+
+
+def _solved(shape: _Shape, batch: _Batch) -> tuple[ndarray, ndarray]:
     """Return the mean of [b, a] in prior deviations under a batch's residuals, shape (W, n), and
     their log-likelihood but for the powers of 2 pi, shape (W,).
     """
     right = shape.level * (shape.weight @ batch.cross)
-    projected = torch.linalg.solve_triangular(shape.factor, right[:, :, None], upper=False)
-    mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)
-    explained = projected.square().sum((1, 2))
+    projected = shape.root @ right[:, :, None]
+    mean = shape.root.mT @ projected
+    explained = np.square(projected).sum((1, 2))
     square = batch.square @ shape.weight - explained
     return mean[..., 0], -0.5 * (square + shape.log_det)
 
 
-def _inverse(factor: torch.Tensor) -> torch.Tensor:
-    """Inverse of matrices whose lower Cholesky factors these are; on a GPU torch's function takes
-    them one by one.
-    """
-    if not factor.is_cuda:  # it comes by columns, beside all else by rows; it is symmetric
-        return torch.cholesky_inverse(factor).mT
-    unit = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
-    factor_inverse = torch.linalg.solve_triangular(factor, unit, upper=False)
-    return factor_inverse.mT @ factor_inverse
-
-
-def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
+def _weighed(weight: ndarray, inner: ndarray) -> ndarray:
     """Sum over the channels, shape (W, i, j)."""
     count, channels, *shape = inner.shape
     total = weight @ inner.reshape(count, channels, -1)
     return total.reshape(count, *shape)
 
 
-def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _curved(shape: _Shape, batch: _Batch) -> tuple[ndarray, ndarray, ndarray]:
     """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and
     curvature by [blocks, scales].
     """
-    covariance = _inverse(shape.factor)
-    variance = covariance.diagonal(dim1=1, dim2=2).clone()
+    covariance = shape.root.mT @ shape.root
+    variance = _diagonal(covariance).copy()
     count, channels = batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
-    # as products of matrices they take ten times as long on a GPU
-    spread = (batch.hidden * scaled[:, None]).sum((2, 3))
+    spread = np.einsum("wcij,wij->wc", batch.hidden, scaled)
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
     # kept from taking others.
-    taken = torch.minimum(torch.clamp(shape.weight * spread, min=0.0), batch.count)
-    squared = covariance.square_()
+    taken = np.clip(shape.weight * spread, 0.0, batch.count)
+    squared = np.square(covariance, out=covariance)
     shared = in_blocks @ (variance - squared.sum(-1))[:, :, None]
-    squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
-    part = taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300)
+    _diagonal(squared)[:] = (1.0 - variance) ** 2
+    part = taken / np.maximum(taken.sum(-1, keepdims=True), 1e-300)
     mixed = 2.0 * shared * part[:, None]
-    remaining = torch.clamp(batch.count - taken, min=0.0)
-    curvature = shape.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
+    remaining = np.maximum(batch.count - taken, 0.0)
+    curvature = np.zeros((count, BLOCKS + channels, BLOCKS + channels))
     curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
     curvature[:, :BLOCKS, BLOCKS:] = mixed
     curvature[:, BLOCKS:, :BLOCKS] = mixed.mT
-    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * remaining)
+    _diagonal(curvature[:, BLOCKS:, BLOCKS:])[:] = 2.0 * remaining
     return variance, spread, curvature
 
 
-def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _looked(batch: _Batch, noise: Noise) -> tuple[ndarray, ndarray, ndarray]:
     """Value, gradient and curvature by [blocks, scales]."""
     shape = _shape(batch, noise)
     variance, spread, curvature = _curved(shape, batch)
@@ -243,7 +249,7 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
     mixed = batch.cross @ moved
     square = batch.square - 2.0 * mixed[..., 0] + bent[..., 0] + spread
     by_scale = square * shape.weight - batch.count
-    return value, torch.cat((by_block[..., 0], by_scale), -1), curvature
+    return value, np.concatenate((by_block[..., 0], by_scale), -1), curvature
 
 
 def _residual_products(
@@ -267,9 +273,8 @@ class _Integrated:
     """The remainder of a batch's effects; of windows with fewer of them, the last are 0."""
 
     shape: _Shape
-    weight: ndarray  # of the channels, shape (C,)
     # L^-1 P^1/2 U' W S, with L of the posterior's precision, shape (W, n, K)
-    half: torch.Tensor
+    half: ndarray
     information: ndarray  # shape (W, K, K)
 
     def of_residuals(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
@@ -277,16 +282,16 @@ class _Integrated:
         same derivatives.
         """
         hidden, effects, square = _residual_products(grams, *self.half.shape[1:])
-        right = self.shape.level * torch.from_numpy(self.weight @ hidden).to(self.half.device)
-        projected = torch.linalg.solve_triangular(self.shape.factor, right[:, :, None], upper=False)
+        weight = self.shape.weight
+        right = self.shape.level * (weight @ hidden)
+        projected = self.shape.root @ right[:, :, None]
         explained = self.half.mT @ projected
-        part = self.shape.log_det - projected.square().sum((1, 2))
-        explained, part = all_to_host((explained[..., 0], part))
-        return self.weight @ effects - explained, square @ self.weight + part
+        part = self.shape.log_det - np.square(projected).sum((1, 2))
+        return weight @ effects - explained[..., 0], square @ weight + part
 
 
 class Integrals:
-    """The part of windows' statistics that no residual changes; it stays on the device."""
+    """The part of windows' statistics that no residual changes."""
 
     def __init__(self, stack: Stack, grams: Sequence[Gram], noise: Noise):
         """Integrate at some noise levels; ``grams``: of the stack."""
@@ -324,15 +329,13 @@ def _integrated(batch: _Batch, noise: Noise, count: int) -> _Integrated:
     """Integrate a batch of windows; ``count``: most effects of any window."""
     shape = _shape(batch, noise)
     _, channels, n = batch.cross.shape
-    device = str(batch.square.device)
 
-    def weighed(parts: Sequence[ndarray], height: int) -> torch.Tensor:
-        return _weighed(shape.weight, side_by_side(parts, (channels, height, count), device))
+    def weighed(parts: Sequence[ndarray], height: int) -> ndarray:
+        return _weighed(shape.weight, _padded(parts, (channels, height, count)))
 
     right = weighed([g.inner[:, : g.hidden, g.hidden :] for g in batch.grams], n)
     effects = weighed([g.inner[:, g.hidden :, g.hidden :] for g in batch.grams], count)
     scaled = shape.level[:, :, None] * right
-    half = torch.linalg.solve_triangular(shape.factor, scaled, upper=False)
+    half = shape.root @ scaled
     reduced = effects - half.mT @ half
-    information = (0.5 * (reduced + reduced.mT)).cpu().numpy()
-    return _Integrated(shape, noise.scale**-2.0, half, information)
+    return _Integrated(shape, half, 0.5 * (reduced + reduced.mT))

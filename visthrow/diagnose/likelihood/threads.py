@@ -9,7 +9,6 @@ import gc
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from threading import Event
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -20,20 +19,12 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 THREADS = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
-# the same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a
-# fifth
-THREADS_ASIDE = 2
 PIECES = 4  # of what is to be done, for each thread
-# tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth
-# longer
-THREADS_BESIDE_GPU = 3
 TRIM_THRESHOLD = -1  # options of ``mallopt``, as glibc's ``malloc.h`` numbers them
 MMAP_THRESHOLD = -3
 BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
 # bytes from which an array has a mapping of its own, which goes back when it is freed
 MAPPED = 2**30
-
-_aside = Event()
 
 
 @cache
@@ -53,11 +44,6 @@ def keep_freed_memory() -> None:
     mallopt(TRIM_THRESHOLD, BYTES_KEPT)
 
 
-def limit_threads_beside_gpu() -> None:
-    """Limit this process's small work to the threads that it needs beside a GPU."""
-    _aside.set()
-
-
 def limit_to_one_thread() -> None:
     """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this
     process has loaded.
@@ -68,8 +54,8 @@ def limit_to_one_thread() -> None:
 
 
 @cache
-def _pool(name: str, threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, name, limit_to_one_thread)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "algebra", limit_to_one_thread)
 
 
 def parallel_map(function: Callable[..., R], *columns: Iterable[Any]) -> list[R]:
@@ -78,23 +64,16 @@ def parallel_map(function: Callable[..., R], *columns: Iterable[Any]) -> list[R]
     ``columns``: one for each argument, as the built-in ``map`` takes them.
     """
     items = list(zip(*columns))
-    threads = min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
+    threads = min(cores(), THREADS)
     if min(threads, len(items)) < 2:
         return [function(*item) for item in items]
     pieces = min(
         PIECES * threads, len(items)
     )  # each item by itself would cost as much as the small ones take
-    parts = _pool("algebra", threads).map(
+    parts = _pool(threads).map(
         lambda first: [function(*item) for item in items[first::pieces]], range(pieces)
     )
     results: list[R] = [None] * len(items)
     for first, part in enumerate(parts):
         results[first::pieces] = part
     return results
-
-
-def run_concurrently(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """Return the function of every item, in order, a few at once; each may call
-    :func:`parallel_map`.
-    """
-    return list(_pool("tasks", THREADS_BESIDE_GPU).map(function, items))

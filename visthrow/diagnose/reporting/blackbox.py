@@ -120,7 +120,7 @@ def train(
     information = np.zeros((len(names), size, size))
     score = np.zeros((len(names), size))
     grams = [with_latent_effects(gram) for gram in point.grams]
-    parts = integrals(grams, point.noise, point.device).statistics(grams, point.theta)
+    parts = integrals(grams, point.noise).statistics(grams, point.theta)
     count = len(point.theta)
     sizes = np.zeros(len(parts.theta))
     sizes[:count] = 0.0 if theta is None else theta

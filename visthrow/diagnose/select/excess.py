@@ -91,7 +91,7 @@ def positions_of(point: Point) -> list[int]:
 def _stack_of(point: Point, phase: str) -> Stack:
     """Return the windows of a phase side by side."""
     windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-    return Stack([point.grams[w] for w in windows], point.device, windows)
+    return Stack([point.grams[w] for w in windows], windows)
 
 
 def _likelihood(stack: Stack, noise: Noise, key: tuple[int, str], level: float) -> float:

@@ -66,7 +66,7 @@ def statistics_of(
     grams = grams_of(wide, floors, len(problem.model.channels))
     grams = correlated_of(grams, wide, point.noise.correlation_time)
     noise = levels.only(point.noise, grams, rows)
-    return stack.integrals(grams, noise, point.device).statistics(grams, point.theta)
+    return stack.integrals(grams, noise).statistics(grams, point.theta)
 
 
 def _evidence(

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
@@ -30,7 +29,7 @@ from visthrow.diagnose.likelihood.marginal import (
     grams_of,
     with_residuals,
 )
-from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Shares, freed, own_shares
 
@@ -144,11 +143,6 @@ class Point:
         """Return the statistics of windows without anything of their own."""
         return self.integrals.statistics(self.grams, self.theta)
 
-    @property
-    def device(self) -> str:
-        """Return where the model simulates, and the algebra of all windows with it."""
-        return self.problem.model.device
-
     @cached_property
     def statistics(self) -> Statistics:
         """Return the statistics of what flights share: each flight's random shares are integrated
@@ -186,7 +180,7 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
     the point."""
     changed = replace(point, **changes)
     if integrals is None:
-        integrals = stack.integrals(changed.grams, changed.noise, changed.device)
+        integrals = stack.integrals(changed.grams, changed.noise)
     plain = _by_flight(integrals, changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
 
@@ -220,10 +214,9 @@ def linearise(
         extended = parallel_map(lambda w: with_terms(w, problem.terms, sizes_of), windows_of)
     if commands:
         extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
-    device = problem.model.device
     cleaned, raw = _cleaned(problem, extended)
-    noise, grams = levels.fit(cleaned, raw, start, device)
-    integrals = stack.integrals(grams, noise, device)
+    noise, grams = levels.fit(cleaned, raw, start)
+    integrals = stack.integrals(grams, noise)
     plain = cleaned
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
@@ -259,7 +252,7 @@ def _cleaned(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window],
     floors = problem.priors.floor
     channels = len(problem.model.channels)
     grams = grams_of(windows, floors, channels)
-    cleaned = levels.without_outliers(windows, grams, problem.model.device)
+    cleaned = levels.without_outliers(windows, grams)
     mended = [w for w in range(len(cleaned)) if cleaned[w] is not windows[w]]
     for w, gram in zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)):
         grams[w] = gram
@@ -288,7 +281,7 @@ def _losing(window: Window, columns: ndarray, share: float) -> Window:
 def only(point: Point, windows: Sequence[int]) -> Point:
     """Return a point of some of its windows, with noise levels estimated from these."""
     grams = [point.grams[w] for w in windows]
-    noise = levels.maximised(grams, levels.only(point.noise, grams, windows), point.device)[0]
+    noise = levels.maximised(grams, levels.only(point.noise, grams, windows))[0]
     kept = [point.windows[w] for w in windows]
     commands = [point.commands[w] for w in windows] if point.commands else []
     problem = point.problem.only(windows)
@@ -390,7 +383,7 @@ def with_noise_at(point: Point, theta: ndarray) -> Point:
     flight's random shares beside it.
     """
     grams = with_shares(point, theta)
-    return regathered(point, noise=levels.maximised(grams, point.noise, point.device)[0])
+    return regathered(point, noise=levels.maximised(grams, point.noise)[0])
 
 
 def with_shares(point: Point, theta: ndarray) -> list[Gram]:
@@ -484,22 +477,3 @@ def candidate(point: Point, active: Sequence[int]) -> Point:
             break
         point = with_noise_at(point, point.theta)
     return point
-
-
-def candidates(
-    points: Sequence[Point], sets: Sequence[Sequence[int]]
-) -> list[Point | DiagnoseError]:
-    """Return :func:`candidate` of several sets, or why there is none: side by side where they wait
-    for a GPU.
-    """
-    pairs = list(zip(points, sets))
-
-    def simulated(i: int) -> Point | DiagnoseError:
-        try:
-            return candidate(*pairs[i])
-        except DiagnoseError as error:
-            return error
-
-    if not pairs or points[0].device == "cpu":
-        return [simulated(i) for i in range(len(pairs))]
-    return run_concurrently(simulated, range(len(pairs)))

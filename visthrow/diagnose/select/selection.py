@@ -37,7 +37,7 @@ from visthrow.diagnose.select.point import (
     ROUNDS,
     Point,
     Problem,
-    candidates,
+    candidate,
     curvature,
     fitted,
     linearise,
@@ -48,7 +48,8 @@ from visthrow.diagnose.select.point import (
 from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
 
-SIDE_BY_SIDE = 4  # sets that are simulated at once on a GPU
+SHORTLIST = 12  # sets that promise most, which are simulated where they are near the best
+FIRST = 4  # sets that are simulated even if they promise less than the best by WINDOW
 REPORTED_SETS = 10  # sets that a step keeps for the report
 
 
@@ -168,10 +169,9 @@ class Selector:
         least = -np.inf
         near: list[Trial] = []  # a trial's matrices are large: others are forgotten
         better: list[Trial] = []
-        while shortlist := self._short(listed, leads, least):
-            tried = self._tried(self.best.point, shortlist)
-            leads |= dict.fromkeys(shortlist, -np.inf)
-            leads |= {t.chosen: t.lead for t in tried}
+        while chosen := self._next(listed, leads, least):
+            tried = self._tried(self.best.point, [chosen])
+            leads[chosen] = max((t.lead for t in tried), default=-np.inf)
             possible = [t for t in tried if t.lead > -self._limit(t.chosen)]
             near += [t for t in possible if self.is_admissible(t)]
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
@@ -218,11 +218,11 @@ class Selector:
         ahead_of.pop(present, None)
         return ahead_of
 
-    def _short(
+    def _next(
         self, listed: Mapping[Names, float], tried: Mapping[Names, float], minimum: float
-    ) -> list[Names]:
-        """Return the next sets to be simulated, best first: what promises more than ``minimum``
-        [nats], and may be possible.
+    ) -> Names:
+        """Return the next set to be simulated, the best that promises more than ``minimum`` [nats]
+        and may be possible; NOTHING where there is none.
 
         A move is expected to fall short of what derivatives promise as its parts did."""
         done = set(tried) | self._visited
@@ -240,14 +240,13 @@ class Selector:
                 parts = (nats for part, nats in shortfalls.items() if part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
         ranked = sorted(expected, key=expected.get, reverse=True)
-        alike = [s for s in ranked[3 * SIDE_BY_SIDE :] if self._limit(s) > STRONG]
-        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
-        close = []
-        for s in ranked[: 3 * SIDE_BY_SIDE] + alike:
+        alike = [s for s in ranked[SHORTLIST:] if self._limit(s) > STRONG]
+        margin = WINDOW if len(tried) < FIRST else STRONG
+        for s in ranked[:SHORTLIST] + alike:
             reach = max(min(margin, self._doubt(s)), self._limit(s))
             if expected[s] > max(minimum, -reach):
-                close.append(s)
-        return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
+                return s
+        return NOTHING
 
     def _limit(self, chosen: Names) -> float:
         """Return by how many nats a set may be behind the best and still be possible: strongly, or
@@ -275,19 +274,17 @@ class Selector:
 
     def _tried(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
         """Simulate sets from a point."""
-        sets = list(sets)
         linear = self.linear(point)
-        shares = [linear.shares(s) for s in sets]
-        columns = [columns_of(s) for s in sets]
-        begins = []
-        for active, (sizes, _) in zip(columns, shares):
-            begins.append(replace(self._with_blocks(point, active), shares=sizes))
         trials = []
-        for s, outcome, (_, occam) in zip(sets, candidates(begins, columns), shares):
-            if isinstance(outcome, DiagnoseError):
-                self.progress(f"{names_of(s)}: not simulated, {outcome}")
+        for s in sets:
+            active = columns_of(s)
+            sizes, occam = linear.shares(s)
+            try:
+                begin = replace(self._with_blocks(point, active), shares=sizes)
+                trial = Trial(s, candidate(begin, active), occam)
+            except DiagnoseError as error:
+                self.progress(f"{names_of(s)}: not simulated, {error}")
                 continue
-            trial = Trial(s, outcome, occam)
             trial = replace(trial, lead=self._value(trial) - self.value)
             # what may not be named gains nothing
             nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)

@@ -115,7 +115,7 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
     extended = parallel_map(with_latent_effects, grams)
-    parts = integrals(extended, noise, point.device).statistics(extended, point.theta)
+    parts = integrals(extended, noise).statistics(extended, point.theta)
     plain = parts.first(len(point.theta)).by(parts.flights)
     return replace(point, noise=noise, grams=grams, plain=plain, shares={}), parts
 

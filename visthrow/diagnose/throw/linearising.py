@@ -7,17 +7,14 @@ their own, tell most of them as well; residuals always come from the nominal ste
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-import torch
 from numpy import ndarray
 
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.law_terms import add_cable
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
@@ -138,15 +135,13 @@ class Linearisation:
             lanes += plans[-1].lanes
             first_knot += 2 * int(self._flights.knots[w])
         flown = self._flights.fly(self._simulation, self._states, lanes)
-        in_order = map if flown.seen.is_cuda else parallel_map
-        slopes = all_to_host(list(in_order(partial(self._slopes, flown.seen), plans)))
-        nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
 
-        def window(i: int) -> Window:
-            residual = self._flights.residual(nominal, plans[i].window, i)
-            return self._window(plans[i], channels[i], residual, slopes[i], flown.knots)
+        def window(plan: Plan, channel: ndarray) -> Window:
+            residual = self._flights.residual(flown.seen, plan.window, plan.first)
+            slopes = self._slopes(flown.seen, plan)
+            return self._window(plan, channel, residual, slopes, flown.knots)
 
-        return parallel_map(window, range(len(plans)))
+        return parallel_map(window, plans, channels)
 
     def _plan(self, w: int, first: int, first_knot: int) -> Plan:
         """Plan the lanes of one window: nominal, those that ride along, those of nominal steps;
@@ -187,19 +182,15 @@ class Linearisation:
         nominal = rough_first * rough
         return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
-    def _slopes(self, samples: torch.Tensor, plan: Plan) -> torch.Tensor:
+    def _slopes(self, samples: ndarray, plan: Plan) -> ndarray:
         """Derivatives of a window's samples by its columns, shape (N, columns).
 
         ``samples``: of all lanes of the run, shape (rows or more, lanes, 3).
         """
         rows = int(self._flights.rows[plan.window])
         lanes = samples[:rows, plan.first : plan.first + len(plan.lanes)]
-        columns = lanes.transpose(1, 2).reshape(3 * rows, -1)
-        place, nominal = (
-            torch.from_numpy(x).to(samples.device) for x in (plan.place, plan.nominal)
-        )
-        change = columns[:, place].sub_(columns[:, nominal])
-        return change.div_(columns.new_tensor(plan.steps))
+        columns = np.swapaxes(lanes, 1, 2).reshape(3 * rows, -1)
+        return (columns[:, plan.place] - columns[:, plan.nominal]) / plan.steps
 
     def _window(
         self,

@@ -2,19 +2,17 @@
 of a batch share.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby, zip_longest
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import warp as wp
 from numpy import ndarray
 
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
 from sim.kernels.replay.lanes import Recording, Replay, Replayed
-from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
@@ -46,11 +44,6 @@ BATCH, CUDA_BATCH = (
     4096,
     32768,
 )  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
-
-
-def downloaded(array: wp.array) -> ndarray:
-    """Copy an array that a replay wrote to the host."""
-    return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
 
 
 def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[list[int]]:
@@ -96,21 +89,12 @@ class Simulation:
         settings: a lane names its by the row.
     """
 
-    def __init__(
-        self,
-        settings: Sequence[Setting],
-        substep: float,
-        device: str,
-        download: Callable[[wp.array], Any] = downloaded,
-    ):
+    def __init__(self, settings: Sequence[Setting], substep: float, device: str):
         """Move them to a device.
 
-        ``substep``: largest integration step [s]; ``download``: makes of the device's arrays what
-        flights return."""
+        ``substep``: largest integration step [s]."""
         self.settings = list(settings)
-        self.replay = Replay(
-            [s.plant for s in settings], [s.sensing for s in settings], device, download=download
-        )
+        self.replay = Replay([s.plant for s in settings], [s.sensing for s in settings], device)
         self.steps = np.array([step_lengths(s, substep) for s in settings])
 
 

@@ -3,12 +3,10 @@ commands.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import compress
-from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy import ndarray
 
 from camera.params import CameraParams
@@ -18,7 +16,7 @@ from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.threads import limit_threads_beside_gpu, parallel_map
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
@@ -45,7 +43,6 @@ from visthrow.diagnose.throw.replay import (
     ReplayedFlights,
     Simulation,
     carried,
-    downloaded,
     grouped,
 )
 from visthrow.logs.flightlog import FlightLog
@@ -100,8 +97,6 @@ class ThrowModel(Model):
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device = device
         self.substep = substep
-        if device != "cpu":
-            limit_threads_beside_gpu()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
@@ -192,7 +187,7 @@ class ThrowModel(Model):
         steps = np.array([self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[e.apply(setting, step) for e, step in zip(entries, steps)]]
         graded = len(self._graded)
-        simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
+        simulation = self.simulation(*settings[: 1 + graded])
         begun = perturbed(states, ways)
         linearisation = Linearisation(
             self.flights, simulation, self._graded, steps[:graded], ways, begun
@@ -326,11 +321,9 @@ class ThrowModel(Model):
         flights = self.cut_into(self.flights.flights, cuts)
         return setting, self._initial_fit(setting, flights).settled({})
 
-    def simulation(
-        self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded
-    ) -> Simulation:
+    def simulation(self, *settings: Setting) -> Simulation:
         """Settings ready to be flown in, with this model's steps."""
-        return Simulation(settings, self.substep, self.device, download)
+        return Simulation(settings, self.substep, self.device)
 
     def _initial_fit(self, setting: Setting, flights: ReplayedFlights) -> InitialFit:
         """Return the fit of initial states in a setting."""
