@@ -153,6 +153,16 @@ def push_at(air: Any, axis: int, size: Any, share: Any):
 
 
 @wp.func
+def latest_command(windows: Any, w: int, data: Any, command: int, delay: Any, time: Any):
+    """Latest command of a window that acts by ``time``, ``command`` or one after it."""
+    latest = int(command)
+    last = windows.command_last[w]
+    while latest + 1 < last and data.command_time[latest + 1] + delay <= time:
+        latest = latest + 1
+    return latest
+
+
+@wp.func
 def next_event(m: Any, windows: Any, w: int, data: Any, command: int, delay: Any):
     """Time at which the next command acts, the latch trips or the payload separates, or of the
     window's end.
@@ -270,6 +280,50 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
     return begin, latch_or_separate
 
 
+def build_keeping(t: Types, structs: SimpleNamespace, chain, store_quad, store_rope):
+    """Build ``write_knot`` and ``write_end``, which write the states that a lane keeps."""
+    real = t.real
+    Moment = structs.Moment
+    Vectors = t.Vectors
+    Reals = t.Reals
+
+    @wp.func
+    def write_knot(knots: structs.Knots, row: int, p: t.Vehicle, m: Moment, pull: real):
+        knots.pos_w[row] = m.quad.pos_w
+        knots.vel_w[row] = m.quad.vel_w
+        knots.quat_wb[row] = m.quad.quat_wb
+        knots.rate_b[row] = m.quad.rate_b
+        f = rotor_thrust(p, m.quad.motor_speed, m.quad.voltage)
+        knots.thrust[row] = f[0] + f[1] + f[2] + f[3]
+        knots.payload_pos_w[row] = m.pay
+        knots.payload_vel_w[row] = m.pay_vel
+        knots.tension[row] = pull
+
+    @wp.func
+    def write_end(
+        ends: structs.State,
+        knots: structs.Knots,
+        lane: int,
+        first_row: int,
+        count: int,
+        p: t.Vehicle,
+        m: Moment,
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
+    ):
+        if m.knot < count:
+            write_knot(knots, first_row + m.knot, p, m, chain.pull(m.rope, stiffness, u))
+        store_quad(ends, lane, m.quad)
+        ends.payload_pos_w[lane] = m.pay
+        ends.payload_vel_w[lane] = m.pay_vel
+        ends.slack_first[lane] = m.slack_first
+        ends.slack_last[lane] = m.slack_last
+        store_rope(ends, lane, n, u, stiffness)
+
+    return write_knot, write_end
+
+
 def build_replay(
     t: Types,
     vehicle: VehicleParams,
@@ -313,21 +367,10 @@ def build_replay(
         Pointers=sampling.Pointers,
     )
     begin, latch_or_separate = build_lane(t, structs, chain, coupled, loose, load_quad, load_rope)
+    write_knot, write_end = build_keeping(t, structs, chain, store_quad, store_rope)
     attached_code = ATTACHED
     loose_code = LOOSE
     tiny = real(TINY)
-
-    @wp.func
-    def write_knot(knots: Knots, row: int, p: t.Vehicle, m: Moment, pull: real):
-        knots.pos_w[row] = m.quad.pos_w
-        knots.vel_w[row] = m.quad.vel_w
-        knots.quat_wb[row] = m.quad.quat_wb
-        knots.rate_b[row] = m.quad.rate_b
-        f = rotor_thrust(p, m.quad.motor_speed, m.quad.voltage)
-        knots.thrust[row] = f[0] + f[1] + f[2] + f[3]
-        knots.payload_pos_w[row] = m.pay
-        knots.payload_vel_w[row] = m.pay_vel
-        knots.tension[row] = pull
 
     @unique_kernel(module_options={"cpu_compiler_flags": FLAGS + CPU_OPTIONS})
     def replay_kernel(
@@ -377,11 +420,7 @@ def build_replay(
         command = windows.command_first[w]
         delay = p.queue.delay
         while m.time < end - tiny:
-            while (
-                command + 1 < windows.command_last[w]
-                and data.command_time[command + 1] + delay <= m.time + tiny
-            ):
-                command = command + 1
+            command = latest_command(windows, w, data, command, delay, m.time + tiny)
             m = latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
             until = next_event(m, windows, w, data, command, delay)
             if m.knot < windows.knots[w]:
@@ -485,14 +524,7 @@ def build_replay(
             m.time = until
 
         if lanes.keep[lane] >= 0:
-            if m.knot < windows.knots[w]:
-                knot_row = lanes.keep[lane] + m.knot
-                write_knot(knots, knot_row, p, m, chain.pull(m.rope, stiffness, u))
-            store_quad(ends, lane, m.quad)
-            ends.payload_pos_w[lane] = m.pay
-            ends.payload_vel_w[lane] = m.pay_vel
-            ends.slack_first[lane] = m.slack_first
-            ends.slack_last[lane] = m.slack_last
-            store_rope(ends, lane, n, u, stiffness)
+            knot_count = windows.knots[w]
+            write_end(ends, knots, lane, lanes.keep[lane], knot_count, p, m, n, u, stiffness)
 
     return ReplayKernel(replay_kernel, **vars(structs))
