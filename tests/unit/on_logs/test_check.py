@@ -658,3 +658,41 @@ def test_an_accelerometer_that_its_own_axes_fit_is_not_exchanged(turned_deg, exc
     pos = np.cumsum(vel, axis=0) * 0.01
     log = log_at(time, pos_w=pos, vel_w=vel, quat_wb=turn.as_quat(), acc_b=force)
     assert ("acc_b fits as" in faults(log)) == exchanged
+
+
+def test_a_payload_that_swings_in_circles_exchanges_no_axes():
+    """A velocity that a filter delays looks like a quarter turn of the cable's pull."""
+    time = np.arange(0.0, 20.0, 0.01)
+    circle = np.column_stack([np.cos(6.0 * time), np.sin(6.0 * time), np.zeros_like(time)])
+    force_w = circle + [0.0, 0.0, G]
+    thrust = force_w - 0.12 * circle  # less the cable's pull
+    turn = upright(thrust / norm(thrust, axis=1, keepdims=True), [1.0, 0.0, 0.0])
+    force = turn.inv().apply(force_w) + default_rng(5).normal(0.0, 0.1, force_w.shape)
+    late = 6.0 * (time - 0.08)
+    vel = np.column_stack([np.sin(late), -np.cos(late), np.zeros_like(time)]) / 6.0
+    log = log_at(time, vel_w=vel, quat_wb=turn.as_quat(), acc_b=force)
+    assert "acc_b fits as" not in faults(log)
+
+
+def test_commands_that_come_ten_times_a_second_are_of_no_other_flight():
+    """Rates that turn back and forth between two commands do not follow these as they are logged."""
+    time = np.arange(0.0, 40.0, 0.01)
+    rng = default_rng(6)
+    steps = rng.normal(0.0, 1.0, (len(time) // 4, 3)).repeat(4, axis=0)
+    rates = np.roll(steps, 3, axis=0)
+    log = log_at(time, rate_b=rates)
+    slow = Channel(time[::10], steps[::10], "rad/s", "body")
+    log = with_channels(log, rate_setpoint_b=slow)
+    assert "not the same flight" not in faults(log)
+    assert "too seldom" in faults(log, "warn")
+
+
+def test_a_noisy_path_dilutes_its_velocity():
+    """Positions of a receiver whose noise makes half of what their slope moves."""
+    time = np.arange(0.0, 60.0, 0.1)
+    rng = default_rng(7)
+    vel = np.sin(np.outer(time, [0.7, 0.9, 1.1]))
+    pos = np.cumsum(vel, axis=0) * 0.1 + rng.normal(0.0, 0.09, vel.shape)
+    log = log_at(time, pos_w=pos, vel_w=vel)
+    assert "no unit explains it" not in faults(log)
+    assert "noise dilutes it" in faults(log, "warn")

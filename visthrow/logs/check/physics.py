@@ -36,6 +36,7 @@ CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
+_FILTERED = 0.1  # by which filters may delay a path beside an attitude [s]
 _RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
 DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
@@ -195,10 +196,12 @@ def _together_rows(
     yield Row("frames", channels, "ok", text, figures)
     if usual[0] < relation.scale < usual[1]:
         return
-    weak = abs(relation.correlation) < FIRMLY and 0.4 < relation.scale < usual[1]
-    hint = relations.unit_hint(relation.scale) or "no unit explains it"
+    hint = relations.unit_hint(relation.scale)
+    # noise of the first alone takes from the ratio what it takes from the correlation's square
+    lowest = usual[0] * relation.correlation**2
+    weak = not hint and lowest < relation.scale < usual[1]
     text = f"the second is {relation.scale:.4g} times the first: "
-    text += "noise dilutes it" if weak else hint
+    text += "noise dilutes it" if weak else hint or "no unit explains it"
     yield Row("units", channels, "warn" if weak else "bad", text, figures)
 
 
@@ -335,8 +338,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
         return
     wrong = _exchanged(relation, channels)
     if wrong is None and sensed:
-        expected_b = Samples(time, rotate_back(turn, acc + _UP))
-        wrong = _exchanged_body(expected_b, force_b, channels)
+        wrong = _exchanged_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is None:
         yield from _pushed(relation, acc, pushed, channels, sensed)
     else:
@@ -393,24 +395,33 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
-def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row | None:
+def _exchanged_body(
+    acc: Samples, attitude: Samples, force_b: Samples, channels: str
+) -> Row | None:
     """Return a row where an accelerometer's x and y fit better exchanged. They feel drag and cable
     alone; z, which feels the thrust, is left out.
     """
-    time = expected_b.time
+    time = acc.time
     known = (time > force_b.time[0] + _SPAN) & (time < force_b.time[-1] - _SPAN)
     grid = time[known]
     if len(grid) < 50:
         return None
     level = np.array([1.0, 1.0, 0.0])
     measured = Samples(grid, level * force_b.mean_over(grid, 2.0 * _SPAN))
-    expected = Samples(grid, level * expected_b.values[known])
-    relation = relations.relate(expected, measured, reach=_DELAY_BAD)
-    if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
+    force_w = acc.values[known] + _UP
+    found = []
+    for shift in np.arange(-_FILTERED, 1.5 * _FILTERED, _FILTERED):
+        expected = level * rotate_back(attitude.attitudes(grid + shift), force_w)
+        relation = relations.relate(Samples(grid, expected), measured, reach=_DELAY_BAD)
+        if relation is None:
+            return None
+        found.append(relation)
+    # axes that are exchanged do not correlate as they are, by no attitude that a filter delays; of
+    # a payload that swings in circles, an attitude that is late looks like a quarter turn
+    if max(relation.correlation for relation in found) > BELONGS:
         return None
-    # axes that are exchanged do not correlate as they are; where they do, an attitude that is late
-    # lets others fit better
-    if relation.correlation > BELONGS:
+    relation = found[len(found) // 2]
+    if relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
         return None
     figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
     return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
@@ -502,7 +513,8 @@ def _commands(log: FlightLog) -> Iterator[Row]:
         if relation is not None:
             channels = f"{name}, {turning}"
             early = _early(relation, set_points, rates, channels)
-            yield early or _followed(relation, channels, spread)
+            period = max(np.median(np.diff(clock)) for clock in (time, rates.time))
+            yield early or _followed(relation, channels, spread, period)
 
 
 def _early(
@@ -531,8 +543,19 @@ def _early(
     return Row("delay", channels, "bad", text, figures)
 
 
-def _followed(relation: relations.Relation, channels: str, spread: float) -> Row:
+def _followed(relation: relations.Relation, channels: str, spread: float, period: float) -> Row:
+    """Report how rates follow their commands.
+
+    Args:
+        relation: Of the rates to the commands.
+        channels: Both names.
+        spread: Largest deviation of the rates [rad/s].
+        period: Of the slower of both [s].
+    """
     figures = _figures(relation)
+    if _disagrees(relation) and period > 0.5 * _RESPONSE:
+        text = f"come every {1e3 * period:.0f} ms: too seldom to be held against each other"
+        return Row("frames", channels, "warn", text, figures)
     if _disagrees(relation):
         text = (
             "the rates do not follow the commands"
