@@ -675,7 +675,7 @@ def test_a_payload_that_swings_in_circles_exchanges_no_axes():
 
 
 def test_commands_that_come_ten_times_a_second_are_of_no_other_flight():
-    """Rates that turn back and forth between two commands do not follow these as they are logged."""
+    """Rates that turn back and forth between two commands do not follow those that are logged."""
     time = np.arange(0.0, 40.0, 0.01)
     rng = default_rng(6)
     steps = rng.normal(0.0, 1.0, (len(time) // 4, 3)).repeat(4, axis=0)

@@ -395,9 +395,7 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
-def _exchanged_body(
-    acc: Samples, attitude: Samples, force_b: Samples, channels: str
-) -> Row | None:
+def _exchanged_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
     """Return a row where an accelerometer's x and y fit better exchanged. They feel drag and cable
     alone; z, which feels the thrust, is left out.
     """
