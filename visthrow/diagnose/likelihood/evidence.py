@@ -17,6 +17,7 @@ at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and 4, ``LOST_SHARE`` at 0.1 and 0.25,
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy import ndarray
@@ -120,6 +121,11 @@ class Priors:
         visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
         return Priors(floor, slab, bounds[:, 0], bounds[:, 1], visible)
 
+    @cached_property
+    def log_within(self) -> ndarray:
+        """Return the log of each named effect's prior mass within its bounds, shape (K,)."""
+        return _log_mass(np.zeros_like(self.slab), self.slab, self.low, self.high)
+
     def deviation(self, active: Sequence[int]) -> ndarray:
         """Prior deviations with these effects named, shape (K,)."""
         spread = np.full(len(self.floor), SPIKE)
@@ -199,9 +205,7 @@ class Posterior:
     def _log_within(self, sets: Sequence[int] | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
         """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
         priors = self.priors
-        bounds = priors.low[sets], priors.high[sets]
-        slab = priors.slab[sets]
-        return _log_mass(mean, sd, *bounds) - _log_mass(0.0 * slab, slab, *bounds)
+        return _log_mass(mean, sd, priors.low[sets], priors.high[sets]) - priors.log_within[sets]
 
     def additions(self, active: Sequence[int]) -> ndarray:
         """Gain of log Z by naming one more effect, for each effect; -inf for those named already or
@@ -234,12 +238,13 @@ class Posterior:
         variance = sigma[sets[:, :, None], sets[:, None]]
         unit = np.eye(sets.shape[1])
         taken = np.linalg.inv(variance + unit / change[:, None])
-        wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
+        weighed = taken @ mean[..., None]
+        wide_mean = mean - (variance @ weighed)[..., 0]
         # A name widens its prior and so the posterior. What comes out narrower is a set with a name
         # that is there already; it is left out below.
         wide = np.maximum(variance - variance @ taken @ variance, variance)
         wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
-        explained = np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
+        explained = (mean * weighed[..., 0]).sum(-1)
         log_det = np.linalg.slogdet(unit + change[..., None] * variance)[1]
         gain = -0.5 * (explained + log_det) - np.log(priors.slab[sets] / SPIKE).sum(1)
         gain = gain + self._log_within(sets, wide_mean, wide_sd).sum(-1)
