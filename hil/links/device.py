@@ -126,7 +126,7 @@ def refused(port: str, number: int, error: OSError, option: str = "") -> LinkErr
         port: Its name, as ``udp:127.0.0.1:14560``.
         number: Its number.
         error: What the system said.
-        option: Option that names another port.
+        option: Option that names another port; where there is none, the port cannot be changed.
     """
     if error.errno == errno.EADDRNOTAVAIL:
         return LinkError(
@@ -138,7 +138,7 @@ def refused(port: str, number: int, error: OSError, option: str = "") -> LinkErr
     return LinkError(
         f"cannot listen on {port}: another program has it, perhaps a second `visthrow hil`, a"
         f" ground station or a simulator; `ss -{port[0]}lnp 'sport = :{number}'` shows which. End"
-        f" it, or take another port{option and ': ' + option}"
+        f" it{option and ', or take another port: ' + option}"
     )
 
 

@@ -100,7 +100,7 @@ class TeamLink:
         self.offset = offset
         self._period = period
         self._agreement = Agreement(params.member, len(devices), params.delay)
-        self._port = open_port(devices[params.member])
+        self._port = open_port(devices[params.member], "team.members in every config")
         members = {(device.host, device.port): k for k, device in enumerate(devices)}
         self._others = {address: k for address, k in members.items() if k != params.member}
 

@@ -11,8 +11,9 @@ import threading
 
 import numpy as np
 from numpy.testing import assert_allclose
-from pytest import approx, fixture, mark
+from pytest import approx, fixture, mark, raises
 
+from hil.errors import LinkError
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
@@ -141,3 +142,10 @@ def test_strange_packets_are_none():
 def test_ardupilot_that_starts_again_is_counted(bridge):
     fly(bridge, [(50, servos(1000, 1000, 1000, 1000)), (1, servos(1000, 1000, 1000, 1000))])
     assert bridge.restarts == 1
+
+
+def test_no_other_port_is_advised_than_where_ardupilot_sends(bridge, monkeypatch):
+    monkeypatch.setattr(ardupilot, "SERVOS", bridge.port._open.getsockname()[1])
+    with raises(LinkError) as caught:
+        bridge.connect(None)
+    assert str(caught.value).endswith("shows which. End it")

@@ -19,6 +19,7 @@ from visthrow.common.arguments import (
     run_command,
 )
 from visthrow.common.errors import VisthrowError
+from visthrow.common.extras import missing_package
 from visthrow.common.toml_text import tables_beside
 
 _TABLES = tables_beside(__file__, "commands.toml")
@@ -94,12 +95,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 " 3, which another package here asks for, was installed over it; install"
                 " 'visthrow[reference]' in an environment of its own"
             )
-        package = (error.name or "").split(".")[0]
-        extra = _TABLES["extras"].get(package)
+        extra = _TABLES["extras"].get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         return _refuse(
-            f"this needs the package '{package}'; install it with: pip install 'visthrow[{extra}]'"
+            f"this needs the package '{missing_package(error)}'; install it with: pip install"
+            f" 'visthrow[{extra}]'"
         )
     except (VisthrowError, ValueError, OSError) as error:
         if os.environ.get(TRACEBACK_VARIABLE):

@@ -5,6 +5,22 @@ from types import ModuleType
 
 from visthrow.common.errors import VisthrowError
 
+PACKAGES = {
+    "cv2": "opencv-python-headless",
+    "mujoco": "mujoco-core",
+    "rsl_rl": "rsl-rl-lib",
+    "serial": "pyserial",
+    "skimage": "scikit-image",
+    "warp": "warp-lang",
+}
+"""Packages by the name that they are imported by, where the two differ."""
+
+
+def missing_package(error: ModuleNotFoundError) -> str:
+    """Return the name to install of the package that could not be imported."""
+    module = (error.name or "").partition(".")[0]
+    return PACKAGES.get(module, module)
+
 
 def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -> ModuleType:
     """Import a module that needs an optional extra, for ``what``.
@@ -15,8 +31,7 @@ def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as missing:
-        package = (missing.name or module).partition(".")[0]
         raise error(
-            f"{what} needs the package '{package}'; install it with: pip install"
+            f"{what} needs the package '{missing_package(missing)}'; install it with: pip install"
             f" 'visthrow[{extra}]'"
         ) from None

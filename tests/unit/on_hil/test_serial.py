@@ -1,6 +1,7 @@
 """MSP on a serial port (a pseudo-terminal), and what is written down of it."""
 
 import os
+import sys
 import time
 import tty
 
@@ -75,3 +76,10 @@ def test_a_port_that_is_not_there_is_named_once():
         "cannot open /dev/no_such_port: No such file or directory; plugged in here: "
     )
     assert str(caught.value).count("no_such_port") == 1
+
+
+def test_a_missing_package_is_named_as_it_is_installed(monkeypatch):
+    """Of pyserial, which is imported as ``serial``."""
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with raises(LinkError, match=r"package 'pyserial'; .* 'visthrow\[serial\]'"):
+        SerialPort(Device("serial", "/dev/ttyACM0", 115200))
