@@ -187,6 +187,33 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, yaw, monkeyp
         assert product / simulator.square().sum() == approx(1.0, abs=allowed), key
 
 
+@mark.parametrize(("pull", "share"), [(1.0, 1.0), (0.2, 0.2), (0.05, 0.0)])
+def test_a_taut_rope_draws_the_payload_after_the_vehicle(pull, share):
+    """Over a step the support of a pendulum moves by v dt / 2 in the mean, which turns the rope by
+    v dt / 2 l: under a pull T the payload gains T / m times that and dt. A nearly slack rope, of a
+    payload that all but falls, passes nothing on.
+    """
+    fo = first_order("state", "first_order.decay=1.0", reaction=0.0)
+    period = fo.experiment.sim.control_period
+    length = 0.4
+    x = fo.flights.x
+    for tensor in x.values():
+        tensor.zero_()
+    x["quat"][..., 3] = 1.0
+    x["load_pos"][:] = fo.flights.mount
+    x["load_pos"][..., 2] -= length
+    x["load_vel"][1, :, 2] = (pull - 1.0) * GRAVITY * period
+    fo.flights.last = 1
+    fo.flights.steps[:] = 1
+    for tensor in fo.flights.adjoint.values():
+        tensor.zero_()
+    fo.flights.adjoint["load_vel"][1, :, 0] = 1.0
+    fo.backward()
+    drawn = torch.full((24,), share * GRAVITY * period**2 / (2.0 * length))
+    assert_close(fo.flights.adjoint["vel"][0, :, 0], drawn, rtol=1e-3, atol=0.0)
+    assert_close(fo.flights.adjoint["load_vel"][0, :, 0], 1.0 - drawn)
+
+
 def test_derivatives_decay_with_each_step():
     """With a decay of next to nothing no earlier action moves a state."""
     fo = first_order("state", "first_order.decay=1e-12")
