@@ -9,8 +9,8 @@ import numpy as np
 from numpy import ndarray
 
 STEPS = 5  # Gauss-Newton steps with the same derivatives
-# a step that promises a fall of the cost by less than this share is not tried
-SETTLED = 0.01
+# a step that promises less than this [nats] is not tried
+SETTLED = 1e-3
 SHARES = 1.0, 0.3  # of a step, which are tried in turn
 
 
@@ -36,9 +36,10 @@ def settle(
     for _ in range(STEPS):
         parts = zip(rows, residuals, spread, unknowns)
         steps = np.array([_step(row, r / sigma, at) for row, r, sigma, at in parts])
-        if not np.any(steps):
-            break
+        before = costs
         for share in SHARES:
+            if not np.any(steps):
+                break
             trial = unknowns + share * steps
             flown = fly(trial)
             trial_costs = _costs(flown, spread, trial)
@@ -47,6 +48,8 @@ def settle(
             unknowns = np.where(better[:, None], trial, unknowns)
             costs = np.where(better, trial_costs, costs)
             steps = np.where(better[:, None], 0.0, steps)
+        if np.all(costs > before - 2.0 * SETTLED):
+            break
     return unknowns, residuals
 
 
@@ -65,8 +68,8 @@ def _step(rows: ndarray, off: ndarray, at: ndarray) -> ndarray:
     if not (np.all(np.isfinite(off)) and np.all(np.isfinite(rows))):
         return none  # no step mends that; the search says which window it is
     step = newton(rows, off, at)
-    promised = step @ (rows.T @ off - at)
-    return step if promised > SETTLED * (off @ off + at @ at) else none
+    promised = 0.5 * step @ (rows.T @ off - at)
+    return step if promised > SETTLED else none
 
 
 def _costs(residuals: Sequence[ndarray], spread: Sequence[ndarray], unknowns: ndarray) -> ndarray:
