@@ -366,14 +366,16 @@ class NumericModel(Model, ABC):
             self._slopes = self._slopes_by_start(size)
         middle = np.array([s.start for s in self.stretches])
         sd = np.array([s.nuisance_sd for s in self.stretches])
-        unknowns, residuals = settle(
-            lambda trial: self._off(size, middle + sd * trial),
-            [slope * each for slope, each in zip(self._slopes, sd)],
-            [s.sigma for s in self.stretches],
-            (self._start - middle) / sd,
-        )
-        self._start = middle + sd * unknowns
-        return residuals
+        sigmas = [s.sigma for s in self.stretches]
+
+        def fly(unknowns: ndarray) -> list[ndarray]:
+            residuals = self._off(size, middle + sd * unknowns)
+            return [residual / sigma for residual, sigma in zip(residuals, sigmas)]
+
+        parts = zip(self._slopes, sd, sigmas)
+        rows = [slope * each / sigma[:, None] for slope, each, sigma in parts]
+        self._start = middle + sd * settle(fly, rows, (self._start - middle) / sd)
+        return self._off(size, self._start)
 
     def _slopes_by_start(self, size: ndarray) -> list[ndarray]:
         """Return the derivatives of the samples by what is not known at the start."""

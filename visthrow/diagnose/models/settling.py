@@ -8,49 +8,37 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy import ndarray
 
-STEPS = 5  # Gauss-Newton steps with the same derivatives
-# a step that promises less than this [nats] is not tried
-SETTLED = 1e-3
-SHARES = 1.0, 0.3  # of a step, which are tried in turn
+STEPS = 8  # Gauss-Newton steps at most, with the same derivatives
+SETTLED = 1e-3  # a step that promises less than this [nats] is not tried
+SHORTER = 0.3  # share of a step that is tried after one that did not help
 
 
 def settle(
-    fly: Callable[[ndarray], list[ndarray]],
-    slopes: Sequence[ndarray],
-    spread: Sequence[ndarray],
-    unknowns: ndarray,
-) -> tuple[ndarray, list[ndarray]]:
+    fly: Callable[[ndarray], list[ndarray]], rows: Sequence[ndarray], unknowns: ndarray
+) -> ndarray:
     """Fit unknowns by Gauss-Newton steps; each window takes those that lower its cost.
 
-    Returns the unknowns, and the residuals that they leave.
-
     Args:
-        fly: returns the windows' residuals from unknowns, shape (N,) each.
-        slopes: derivatives of the windows' samples by the unknowns, shape (N, D) each.
-        spread: deviation of the samples from a right simulation, shape (N,) each.
+        fly: returns the windows' residuals from unknowns, in their deviations, shape (N,) each.
+        rows: derivatives of the windows' samples by the unknowns, likewise, shape (N, D) each.
         unknowns: to begin with, shape (W, D).
     """
-    rows = [slope / sigma[:, None] for slope, sigma in zip(slopes, spread)]
-    residuals = fly(unknowns)
-    costs = _costs(residuals, spread, unknowns)
+    off = fly(unknowns)
+    costs = _costs(off, unknowns)
+    reach = np.ones(len(unknowns))
     for _ in range(STEPS):
-        parts = zip(rows, residuals, spread, unknowns)
-        steps = np.array([_step(row, r / sigma, at) for row, r, sigma, at in parts])
-        before = costs
-        for share in SHARES:
-            if not np.any(steps):
-                break
-            trial = unknowns + share * steps
-            flown = fly(trial)
-            trial_costs = _costs(flown, spread, trial)
-            better = trial_costs < costs
-            residuals = [new if x else old for x, new, old in zip(better, flown, residuals)]
-            unknowns = np.where(better[:, None], trial, unknowns)
-            costs = np.where(better, trial_costs, costs)
-            steps = np.where(better[:, None], 0.0, steps)
-        if np.all(costs > before - 2.0 * SETTLED):
+        steps = np.array(list(map(_step, rows, off, unknowns)))
+        if not np.any(steps):
             break
-    return unknowns, residuals
+        trial = unknowns + reach[:, None] * steps
+        flown = fly(trial)
+        trial_costs = _costs(flown, trial)
+        better = trial_costs < costs
+        off = [new if helps else old for helps, new, old in zip(better, flown, off)]
+        unknowns = np.where(better[:, None], trial, unknowns)
+        costs = np.where(better, trial_costs, costs)
+        reach = np.where(better, 1.0, SHORTER * reach)
+    return unknowns
 
 
 def newton(rows: ndarray, off: ndarray, at: ndarray | float = 0.0) -> ndarray:
@@ -72,8 +60,7 @@ def _step(rows: ndarray, off: ndarray, at: ndarray) -> ndarray:
     return step if promised > SETTLED else none
 
 
-def _costs(residuals: Sequence[ndarray], spread: Sequence[ndarray], unknowns: ndarray) -> ndarray:
+def _costs(off: Sequence[ndarray], unknowns: ndarray) -> ndarray:
     """Return the sum of squares of each window; infinite where a simulation ran away."""
-    squares = [np.sum((r / sigma) ** 2) for r, sigma in zip(residuals, spread)]
-    costs = np.array(squares) + np.sum(unknowns**2, axis=1)
+    costs = np.array([part @ part for part in off]) + np.sum(unknowns**2, axis=1)
     return np.where(np.isnan(costs), np.inf, costs)

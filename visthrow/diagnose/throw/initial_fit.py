@@ -49,7 +49,8 @@ class InitialFit:
     """Fits the states of the windows that count in one setting.
 
     Attributes:
-        slopes: derivatives of those windows' samples by their states, where they were taken last.
+        rows: derivatives of those windows' samples by their states, as :func:`.settling.settle`
+            takes them.
     """
 
     def __init__(self, flights: ReplayedFlights, simulation: Simulation, lag: float):
@@ -62,37 +63,36 @@ class InitialFit:
         self._numbers = np.array([w for w, c in enumerate(flights.cuts) if c.retained], dtype=int)
         free = [x.follows and x.field not in TRUSTED for x in self.directions]
         self._sd = deviations(self.directions, [flights.cuts[w] for w in self._numbers]) * free
-        telling = [sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))]
-        self._sensitive = [telling[w][0] for w in self._numbers]
-        self._shortened = flights.ended([end for _, end in telling])
+        self._weight, ends = zip(*(telling(flights, w, lag) for w in range(len(flights.cuts))))
+        self._shortened = flights.ended(ends)
 
-    def settled(self, slopes: Sequence[ndarray] = ()) -> States:
+    def settled(self, rows: Sequence[ndarray] = ()) -> States:
         """Fit each window's initial state to its samples, from what flights through the windows
         give; no step that does not help is taken.
 
-        ``slopes``: as :attr:`slopes` of another fit has them, if they are known."""
+        ``rows``: as :attr:`rows` of another fit has them, if they are known."""
         states, _ = carried(self.flights, self.simulation)
-        f = self.flights
         begun = rows_of(states, self._numbers)
-        self.slopes = slopes or self._slopes(begun)
-        scaled = [slope * sd for slope, sd in zip(self.slopes, self._sd)]
-        spread = [np.hypot(f.sigma[w], drift(f, w)) for w in self._numbers]
+        self.rows = rows or self._rows(begun)
+
+        def moved(unknowns: ndarray) -> States:
+            return moved_along(begun, self.directions, self._sd * unknowns)
+
         none = np.zeros(self._sd.shape)
-        unknowns, _ = settle(lambda x: self._residuals(begun, x), scaled, spread, none)
-        fitted = moved_along(begun, self.directions, self._sd * unknowns)
+        unknowns = settle(lambda trial: self._residuals(moved(trial)), self.rows, none)
+        fitted = moved(unknowns)
         fitted[MOVED] = self._sd * unknowns
         for name, value in states.items():
             value[self._numbers] = fitted[name]
         return states
 
-    def _residuals(self, begun: States, unknowns: ndarray) -> list[ndarray]:
-        """Return residuals of what depends on initial states that are moved."""
-        moved = moved_along(begun, self.directions, self._sd * unknowns)
+    def _residuals(self, states: States) -> list[ndarray]:
+        """Return residuals of what tells of initial states, in deviations."""
         lanes = [Lane(w, 0, row) for row, w in enumerate(self._numbers)]
-        residuals = self.flights.residuals(self.simulation, moved, lanes, self._shortened)
-        return [part * residual for part, residual in zip(self._sensitive, residuals)]
+        residuals = self.flights.residuals(self.simulation, states, lanes, self._shortened)
+        return [self._weight[w] * residual for w, residual in zip(self._numbers, residuals)]
 
-    def _slopes(self, states: States) -> list[ndarray]:
+    def _rows(self, states: States) -> list[ndarray]:
         """Return the derivatives of windows' samples by their initial states, shape (N, D) each."""
         count = len(self._numbers)
         lanes = []
@@ -102,37 +102,33 @@ class InitialFit:
         moved = perturbed(states, self.directions)
         measured = self.flights.fly(self.simulation, moved, lanes, self._shortened).seen
         steps = np.array([d.step for d in self.directions])
-        slopes = []
+        rows = []
         first = 0
-        for w, sd, sensitive in zip(self._numbers, self._sd, self._sensitive):
+        for w, sd in zip(self._numbers, self._sd):
             free = np.flatnonzero(sd)
-            slope = np.zeros((len(sensitive), len(sd)))
+            slope = np.zeros((len(self._weight[w]), len(sd)))
             change = self.flights.differences(measured, w, first, len(free))
-            slope[:, free] = change / steps[free] * sensitive[:, None]
-            slopes.append(slope)
+            slope[:, free] = change / steps[free] * sd[free]
+            rows.append(slope * self._weight[w][:, None])
             first += 1 + len(free)
-        return slopes
+        return rows
 
 
-def drift(flights: ReplayedFlights, w: int) -> ndarray:
-    """Return how far gusts may have moved a window's samples by their time, as a deviation, shape
-    (N,).
-    """
-    since = np.maximum(flights.time[w] - flights.cuts[w].start, 0.0)
-    return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
+def telling(flights: ReplayedFlights, w: int, lag: float) -> tuple[ndarray, float]:
+    """Return how much a window's samples tell of its start, one over their deviation from a flight
+    without gusts, and how long it is flown for their sake [s].
 
-
-def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[ndarray, float]:
-    """Which samples tell of a window's start, and how long it is flown for their sake [s].
-
-    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
-    few are left."""
+    Gusts may have moved them by their time. What comes after the payload may have left is 0, for it
+    tells of the release; nothing is where little is left."""
     c = flights.cuts[w]
     time = flights.time[w]
+    since = np.maximum(time - c.start, 0.0)
+    drift = flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
+    weight = 1.0 / np.hypot(flights.sigma[w], drift)
     time_left = flights.flights[c.flight].latch + lag - EARLIER
     if c.payload != ATTACHED or not c.start + FITTED_SPAN < time_left < c.end:
-        return np.ones(len(time)), c.end
-    return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
+        return weight, c.end
+    return weight * (time < time_left), min(time_left + ONWARD, c.end)
 
 
 def following(
@@ -149,8 +145,7 @@ def following(
     ``free``: which parts of the state follow, shape (D,), bool; ``change``: of the effects' sizes,
     shape (K,); ``lag``: of the release, as far as known [s]."""
     samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
-    sensitive = sensitive_samples(flights, w, lag)[0]
-    weight = sensitive / np.hypot(flights.sigma[w], drift(flights, w))
+    weight, _ = telling(flights, w, lag)
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight[:, None]
     moves = np.zeros(len(free))

@@ -116,7 +116,7 @@ class ThrowModel(Model):
             self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + note)
         fitter = self._initial_fit(self.setting, self.flights)
         # states at theta = 0, and the samples' derivatives by them
-        self._nominal = fitter.settled(), fitter.slopes
+        self._nominal = fitter.settled(), fitter.rows
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
@@ -323,13 +323,13 @@ class ThrowModel(Model):
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
-        states, slopes = self._nominal
+        states, rows = self._nominal
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting, self.flights)
         places = [way.place for way in directions(self.setting.plant)]
         alike = [way.place for way in fitter.directions] == places
-        return fitter.settled(slopes if alike else ())
+        return fitter.settled(rows if alike else ())
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
