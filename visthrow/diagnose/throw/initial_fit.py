@@ -1,7 +1,8 @@
 """Initial states of replay windows fitted to their samples.
 
-A simulation of every direction costs some thirty times one of the state itself. So derivatives are
-used for several steps, and may come from another setting whose states were fitted before."""
+A simulation of every direction costs some twenty times one of the state itself. So derivatives are
+taken once, and may come from another setting whose states were fitted before. What that leaves, the
+windows' own likelihood makes up for."""
 
 from collections.abc import Sequence
 
@@ -25,8 +26,7 @@ from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation, ca
 
 DRIFT = 0.02, 0.02, 0.02, 0.04
 """Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m],
-rate [rad/s]. Fitted as though there were none, states took their place: bends of the rope of ten
-times their prior, after twenty steps.
+rate [rad/s]. Fitted as though there were none, states take their place.
 """
 GROWTH = (
     1.5,
