@@ -306,7 +306,7 @@ class TestFlyer:
         selector.best = selector._tried(selector.nominal, [wind])[0]
         listed = {tilt: -9.0, gain: -9.0}
         tried = {gain | {c}: -1.0 for c in selector.candidates[:4]}
-        assert selector._short(listed, tried, -np.inf) == [tilt]
+        assert selector._next(listed, tried, -np.inf) == tilt
 
     def test_a_flight_whose_thrust_differs_says_what_and_by_how_much(self):
         logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]
