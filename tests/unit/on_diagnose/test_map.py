@@ -405,3 +405,21 @@ def test_a_throttle_becomes_a_command_in_newtons():
     assert len(recorded.vehicle.time) == len(recorded.attitude.time) > 1000, (
         "attitudes lie between the positions"
     )
+
+
+def test_an_accelerometer_says_which_column_of_a_quaternion_is_w():
+    """Numbered columns in an autopilot's axes, without a position, beside angular accelerations."""
+    columns = flight()
+    down = np.array([1.0, -1.0, -1.0])
+    x, y, z, w = columns["quat_wb"].T
+    acc = columns["acc_b"] * down
+    rates = columns["rate_b"] * down
+    table = {"time": columns["time"], "q0": w, "q1": x, "q2": -y, "q3": -z}
+    table |= named("acc_b", acc) | named("ang_acc_b", np.gradient(rates, axis=0))
+    table |= named("angular_velocity", rates)
+    found = {channel.name: channel for channel in propose(table, "a.csv").mapping.channels}
+    attitude = found["quat_wb"]
+    assert (attitude.order, attitude.axes, attitude.body_axes) == ("wxyz", "x,-y,-z", "x,-y,-z")
+    assert found["acc_b"].axes == found["rate_b"].axes == "x,-y,-z"
+    assert "pos_w" not in found
+    assert found["rate_b"].unit == "rad/s"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
-from visthrow.common.rotations import rotate_back
+from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, split_unit
 from visthrow.diagnose.inputs.unit_evidence import (
     LENGTHS,
@@ -42,7 +42,8 @@ _COMPARED = 1000  # rows on which the distance of two paths is judged
 _LARGEST_THRUST = 5000.0  # in any unit: what is larger counts to 65535, as a Crazyflie's
 _TURN = 7.0  # above a full turn in radians: degrees
 _UNUSUAL = 1.0  # nats against an order or axes that are not the usual ones
-_TILTED = 10.0  # nats against an attitude that leans over for half of the time
+_TILTED = 10.0  # nats against an attitude that leans over, or whose mean force does
+_UPRIGHT = 0.7  # share of a flight's force that its mean has along up, at least
 _PACK = (2.5, 60.0)  # of any vehicle's battery [V]
 _FRAMES = {"w": "world", "wb": "world", "b": "body", "c": "camera"}
 """Frame of a channel by the end of its name."""
@@ -192,7 +193,6 @@ class Recognition:
         units = ("rad", "deg") if open_unit else (entry.unit,)
         orders = ("wxyz", "xyzw") if open_order else (entry.order,)
         worlds = ("", Y_UP if self.settings else NED)
-        down = self._z_points_down()
         ways: list[Attitude | None] = []
         for unit, order, axes in product(units, orders, worlds):
             tried = replace(entry, unit=unit, order=order, axes=axes, body_axes=axes)
@@ -201,21 +201,26 @@ class Recognition:
                 continue
             doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
             doubt += _TILTED * (physics.median_tilt(channel.samples().values) > physics.STEEPEST)
-            doubt += 0.5 * _TILTED * (-down if axes == NED else down)
+            doubt += _TILTED * self._hangs_askew(channel, axes)
             words = [unit] * open_unit + [f"order {order}"] * open_order
             words.append(f"axes {axes or 'x,y,z'}")
             ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
         return ways
 
-    def _z_points_down(self) -> float:
-        """Return 1 where an accelerometer says that its z points down in flight, -1 where up, else
-        0.
+    def _hangs_askew(self, attitude: Channel, axes: str) -> bool:
+        """Tell whether accelerometers say that an attitude, whose body has these axes, is wrong:
+        over a flight the mean force points up.
         """
-        for group in self._hinting("acc_b"):
-            z = np.nanmedian(group.values[:, 2])
-            if abs(z) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
-                return -np.sign(z)
-        return 0.0
+        attitudes = attitude.samples()
+        groups = self._hinting("acc_b")
+        for group in groups:
+            force_b = self._samples(group)
+            turn = matrix_of_quat(attitudes.attitudes(force_b.time))
+            force_w = turn @ (force_b.values @ turn_to(axes))[..., None]
+            middle = np.median(np.linalg.norm(force_b.values, axis=1))
+            if np.mean(force_w[:, 2]) > _UPRIGHT * middle:
+                return False
+        return bool(groups)
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g) and g.unit not in ("deg", "rad")]
