@@ -20,7 +20,6 @@ CEILINGS = {
     "first lines without a subject": 5,
     "class names twice": 2,
     "file names twice": 4,
-    "wide lines": 1,
     "fmt: skip": 0,
     "tokens a line": 7.0,
 }
@@ -42,7 +41,6 @@ NO_SUBJECT = re.compile(
 SHARED = {"__init__.py", "__main__.py", "cli.py"}
 """Names of files that several folders have rightly."""
 
-WIDEST = 100
 TOKENS = (tokenize.NAME, tokenize.OP, tokenize.NUMBER)
 
 
@@ -62,17 +60,6 @@ def heads(tree: ast.AST) -> Iterator[str]:
             yield (ast.get_docstring(node) or "").partition("\n")[0]
 
 
-def wide(line: str) -> bool:
-    """Tell whether a line is too wide without its remark to a checker, unless it is an address or
-    a row of a table.
-    """
-    return (
-        len(line.split("  # type:")[0].split("  # noqa")[0]) > WIDEST
-        and "://" not in line
-        and not line.lstrip().startswith("|")
-    )
-
-
 def counts(files: dict[str, str]) -> dict[str, float]:
     """Return the counts of modules: path -> text."""
     total: Counter[str] = Counter()
@@ -86,7 +73,6 @@ def counts(files: dict[str, str]) -> dict[str, float]:
             bool(NO_SUBJECT.match(head)) for head in heads(tree)
         )
         classes.update({node.name for node in nodes if isinstance(node, ast.ClassDef)})
-        total["wide lines"] += sum(map(wide, lines))
         total["fmt: skip"] += sum("fmt: skip" in line for line in lines)
         total["lines"] += len(lines)
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
@@ -117,7 +103,6 @@ SPOILT = {
     "first lines without a subject": 'def f():\n    """What it does."""',
     "class names twice": "class First:\n    pass",
     "file names twice": "",
-    "wide lines": f"x = {'1' * WIDEST}",
     "fmt: skip": "x = 1  # fmt: skip",
     "tokens a line": "x = [1, 2, 3, 4, 5, 6, 7, 8, 9]",
 }

@@ -207,22 +207,6 @@ def test_a_bad_command_raises_a_bit_and_does_not_spread(place):
     assert_same(everything(sick), everything(well))
 
 
-def test_a_bad_state_raises_a_bit_and_is_put_back():
-    sick, well = HybridSim(paper_plant(), 3), HybridSim(paper_plant(), 3)
-    vel = np.zeros((3, 3))
-    for sim, broken in ((well, 0.0), (sick, np.nan)):
-        vel[1, 0] = broken
-        sim.place(np.zeros((3, 3)), vel_w=vel)
-        sim.set_command(np.tile([4.0, 1.0, 0.0, 0.0], (3, 1)))
-    before = sick.get("pos_w")
-    for _ in range(3):
-        sick.step()
-        well.step()
-        assert sick.get("status").tolist() == [0, NONFINITE, 0]
-    assert_array_equal(sick.get("pos_w")[1], before[1])
-    assert_same(everything(sick), everything(well), slice(0, None, 2), slice(0, None, 2))
-
-
 @mark.parametrize("kind", ["hybrid", "alone"])
 @mark.parametrize(
     "name", ["setpoint", "gyro", "integral", "motor_speed", "voltage", "charge_used", "rate_b"]

@@ -2,8 +2,6 @@
 they are not there.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
@@ -12,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, AirParams, VehicleParams, changed
+from sim.params import GRAVITY, AirParams, changed
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import EVERYTHING, paper_plant, plain_vehicle
@@ -20,7 +18,6 @@ from tests.simulators import bare_quadrotor
 from visthrow.throws.plants import flown
 
 STEPS = 12  # of 20 ms
-GROUND = frozenset({"ground_effect"})
 REFERENCE_STEP = 2e-3  # s, at most; of order 4: payloads move by 2 nm against steps of a quarter
 AGREEMENT = 3e-4  # m; the simulator's steps of 1 ms alone leave 0.2 mm after such a swing
 DISTINCT = 10.0  # times that agreement an effect must move the payload for the test to say anything
@@ -147,13 +144,6 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     assert_allclose(shot[0], shot[1], atol=5e-3)
 
 
-def test_mount_damping_is_the_joint_damping_of_a_rigid_rope():
-    plant = changed(fine(paper_plant()), {"rope.segments": 1})
-    mount = changed(plant, {"rope.joint_damping": 1e-4, "rope.mount_damping": 4e-4})
-    joint = changed(plant, {"rope.joint_damping": 5e-4})
-    assert np.abs(swing(mount) - swing(joint)).max() < 1e-12
-
-
 def test_flight_under_drag_and_wind():
     drag, side, lift, wind = 5e-3, 2e-3, -1e-3, np.array([3.0, -1.0, 0.0])
     rope = {"rope.payload_drag": drag, "rope.payload_side": side, "rope.payload_lift": lift}
@@ -262,21 +252,18 @@ def test_a_rope_that_gives_is_a_spring(steps):
     assert_allclose(change, expected[0] - expected[1], atol=0.12 * norm(change))  # the mount drifts
 
 
-def slowing(time_constant_down: float) -> VehicleParams:
-    """A plain vehicle whose rotors slow down more slowly than they speed up."""
-    vehicle = plain_vehicle(paper_plant().vehicle)
-    motor = replace(vehicle.motor, kind="asymmetric", time_constant_down=time_constant_down)
-    return replace(vehicle, motor=motor)
-
-
 def test_ground_effect_lifts_as_the_formula_says():
-    vehicle = slowing(0.1)
+    vehicle = plain_vehicle(paper_plant().vehicle)
     height, effect = 0.06, 1.5
     thrust = vehicle.body.mass * GRAVITY
     rise = []
     for air in (AirParams(), AirParams(ground_effect=effect)):
         sim = bare_quadrotor(
-            vehicle, precision="float64", control_period=1e-3, airs=[air], extensions=GROUND
+            vehicle,
+            precision="float64",
+            control_period=1e-3,
+            airs=[air],
+            extensions=frozenset({"ground_effect"}),
         )
         sim.place(np.array([[0.0, 0.0, height]]))
         sim.set_command([[thrust, 0.0, 0.0, 0.0]])
@@ -284,20 +271,6 @@ def test_ground_effect_lifts_as_the_formula_says():
         rise.append(sim.get("vel_w")[0, 2] / 1e-3)
     ratio = vehicle.rotors.radius / (4 * height)
     assert rise[1] - rise[0] == approx(effect * (1 / (1 - ratio**2) - 1) * GRAVITY, rel=2e-3)
-
-
-def test_asymmetric_motor_is_first_order_one_way():
-    vehicle = slowing(0.1)
-    sim = bare_quadrotor(vehicle, precision="float64", step=5e-4, extensions=GROUND)
-    sim.place(np.array([[0.0, 0.0, 1.0]]))
-    before = sim.get("motor_speed")[0, 0]
-    sim.set_command([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]])
-    for _ in range(3):
-        sim.step()
-    acting = 3 * 0.02 - vehicle.queue.delay
-    target = np.sqrt(0.5) * before  # of half the thrust
-    expected = target + (before - target) * np.exp(-acting / 0.1)
-    assert sim.get("motor_speed")[0, 0] == approx(expected, rel=1e-6)
 
 
 def test_the_reference_refuses_what_it_does_not_know():

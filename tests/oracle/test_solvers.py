@@ -109,7 +109,7 @@ def test_a_solver_flies_and_lets_go_as_the_fused_chain_does(solver, substep, nea
     assert_allclose(theirs.get("voltage"), ours.get("voltage"), atol=1e-3)
 
 
-@mark.parametrize(("solver", "substep", "near"), SOLVERS)
+@mark.parametrize(("solver", "substep", "near"), [("chain", 0.002, 0.0), *SOLVERS])
 def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
     """One environment stands still, another's velocity is no number: the third flies as ever."""
     sims = [HybridSim(on(paper_plant(), solver, substep), 3) for _ in range(2)]

@@ -2,17 +2,15 @@
 plain NumPy.
 """
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, PlantParams
-from tests.plants import calm, paper_plant
-from tests.simulators import numerics, random_commands
+from sim.params import GRAVITY, PlantParams, changed
+from tests.plants import paper_plant
+from tests.simulators import random_commands
 
 CLOCK = 1e-6
 """Times are sums of float32 periods [s]."""
@@ -21,15 +19,8 @@ ROUND_OFF = 2e-5
 PERIOD = 0.02
 
 
-def plant(
-    lag: float, precision: str = "float32", control_period: float = PERIOD, **vehicle
-) -> PlantParams:
-    base = paper_plant()
-    changed = replace(base.vehicle, **vehicle)
-    release = replace(base.release, lag=lag)
-    return PlantParams(
-        changed, base.rope, release, numerics(precision=precision, control_period=control_period)
-    )
+def plant(lag: float) -> PlantParams:
+    return changed(paper_plant(), {"release.lag": lag})
 
 
 def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
@@ -129,20 +120,3 @@ def test_outputs_stay_after_the_landing_step():
                 for name in ("landing_w", "time_to_impact", "clearance", "payload_pos_w")
             }
     assert kept is not None
-
-
-def test_the_vehicle_flies_on_alone():
-    """After separation it climbs by its own thrust over its own mass: no rope pulls, drag off."""
-    vehicle = paper_plant().vehicle
-    ideal = replace(vehicle.battery, kind="ideal")
-    params = plant(0.0, "float64", aero=calm(vehicle.aero), battery=ideal)
-    sim = HybridSim(params, 1)
-    weight = GRAVITY * params.total_mass
-    speeds = []
-    for k in range(10):
-        sim.set_command([[weight, 0.0, 0.0, 0.0]], [k == 0])
-        sim.step()
-        speeds.append(sim.get("vel_w")[0, 2])
-    assert_allclose(
-        np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9
-    )
