@@ -11,6 +11,7 @@ import numpy as np
 from numpy.random import default_rng
 
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
+from visthrow.diagnose.select import diagnose_flights
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
@@ -36,6 +37,11 @@ def _placed(time: np.ndarray, forces: np.ndarray) -> np.ndarray:
 def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Position after a unit force on a unit mass at each knot (triangles), shape (T, knots)."""
     return _placed(time, np.array([np.interp(_fine(), knots, row) for row in np.eye(len(knots))]).T)
+
+
+def explain_without_laws(model: Model) -> diagnose_flights.Diagnosis:
+    """Explain flights by the effects of the catalogue alone."""
+    return diagnose_flights.explain(model, laws=False)
 
 
 def catalogue(count: int) -> tuple[Effect, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue, explain_without_laws
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.diagnose.select.point import Problem, linearise, untracked_windows
@@ -40,7 +40,7 @@ class Whipping(SyntheticModel):
 
 
 def explained(size: float):
-    return diagnose_flights.explain(Whipping(truth={NAME: size}, seed=5), laws=False)
+    return explain_without_laws(Whipping(truth={NAME: size}, seed=5))
 
 
 def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_leads():
@@ -78,7 +78,7 @@ def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
     off = []
     for seed in range(3):
         truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
-        diagnosis = diagnose_flights.explain(Levered(truth=truth, seed=seed, throws=8), laws=False)
+        diagnosis = explain_without_laws(Levered(truth=truth, seed=seed, throws=8))
         assert diagnosis.named == (NAME,)
         size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
         off.append((own.estimate - size) / own.sd)
@@ -109,7 +109,7 @@ class Sideways(SyntheticModel):
 def test_of_causes_of_which_only_one_is_there_that_one_is_named():
     """The simulated set holds a cause near 0; without it the other has hardly been listed."""
     model = Sideways(effects=catalogue(20), truth={"effect_01": 40.0}, throws=6, free=2)
-    assert diagnose_flights.explain(model, laws=False).named == ("effect_01",)
+    assert explain_without_laws(model).named == ("effect_01",)
 
 
 BAD = 10

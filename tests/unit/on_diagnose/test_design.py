@@ -8,6 +8,7 @@ import numpy as np
 from pytest import approx, fixture, mark, raises
 
 from tests.configs import load_experiment
+from tests.synthetic_diagnosis import explain_without_laws
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.ball import BallModel
@@ -15,7 +16,6 @@ from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.imu import ImuModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
-from visthrow.diagnose.select import diagnose_flights
 from visthrow.task import plant_of
 
 BASES = {m.name: m for m in catalogue()}
@@ -35,7 +35,7 @@ def hovered(params):
     model = FlyerModel(
         [hover.setup_log(params, {params.position: 3e-4, "payload_pos_w": 3e-4})], params
     )
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     return diagnosis, *fly_manoeuvres.simulator_of(
         model, diagnosis, lambda logs: FlyerModel(logs, params)
     )

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 from pytest import approx, mark
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.reporting.diagnosis_report import instead
-from visthrow.diagnose.select import diagnose_flights, held_out, result, scatter, verdicts
+from visthrow.diagnose.select import held_out, result, scatter, verdicts
 
 
 def promised(nats, came):
@@ -57,7 +57,7 @@ def test_of_what_flights_hardly_show_no_size_is_claimed():
     weak = replace(weak, prior_sd=1e-6 * weak.floor, floor=1e-6 * weak.floor)
     effects = (*EFFECTS[:7], weak, *EFFECTS[8:])
     model = SyntheticModel(effects=effects, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert diagnosis[weak.name].verdict == result.NOT_IDENTIFIABLE
     assert "hardly more than was known" in diagnosis[weak.name].sentence
     assert diagnosis["effect_01"].verdict != result.NOT_IDENTIFIABLE
@@ -72,7 +72,7 @@ def judged(monkeypatch, truth, same=(), **changes):
 
     monkeypatch.setattr(held_out, "measure", measure)
     model = SyntheticModel(truth=truth, same=dict(same), throws=8, free=4, seed=2)
-    return diagnose_flights.explain(model, laws=False)
+    return explain_without_laws(model)
 
 
 @mark.parametrize(
@@ -128,9 +128,8 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
 
 def test_nothing_is_named_over_an_interval_that_holds_zero():
     """Also where the evidence for it is overwhelming."""
-    diagnosis = diagnose_flights.explain(
-        SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
-        laws=False,
+    diagnosis = explain_without_laws(
+        SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
     )
     findings = [replace(f, low=-f.low) if f.name == "effect_05" else f for f in diagnosis.findings]
     wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
@@ -219,5 +218,5 @@ def test_several_forms_at_once_are_another_form(monkeypatch):
         found = forms[:count], {}
         monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, found=found: found)
         model = SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-        overall.append(diagnose_flights.explain(model, laws=False).overall)
+        overall.append(explain_without_laws(model).overall)
     assert overall == [result.KNOWN, result.UNKNOWN]

@@ -22,6 +22,7 @@ from tests.commands import run_command
 from tests.flightlogs import log_at, with_channels
 from tests.places import DATA
 from tests.plants import paper_plant
+from tests.synthetic_diagnosis import explain_without_laws
 from visthrow import config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -104,7 +105,7 @@ class TestBall:
         """
         truth, stamps, paths = beside_aeroid.world(240000100)
         seen = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
-        diagnosis = diagnose_flights.explain(beside_aeroid.model_of(stamps, seen), laws=False)
+        diagnosis = explain_without_laws(beside_aeroid.model_of(stamps, seen))
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
         assert all(
@@ -253,9 +254,7 @@ class TestFlyer:
 
     def test_what_neither_name_nor_law_explains_is_told(self):
         logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
-        diagnosis = diagnose_flights.explain(
-            FlyerModel(logs, replace(FLYER, command_delay=LATE)), laws=False
-        )
+        diagnosis = explain_without_laws(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
         assert diagnosis.overall in ("UNKNOWN", "EXPLAINED IN PART")
         assert any("noise alone" in reason for reason in diagnosis.reasons)
 
@@ -281,7 +280,7 @@ class TestFlyer:
     def test_wind_is_told_as_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
         model = self.in_wind(monkeypatch, 0.1, drag=0.03, wind=1.5)
         model.effects = measures.narrowed(model.effects, measures.parsed(stated))
-        found = diagnose_flights.explain(model, laws=False)
+        found = explain_without_laws(model)
         named = {f.name for f in found.findings if f.verdict in result.NAMED}
         assert stated or not named & {"frame_tilt_y", "marker_rot_y"}
         assert ("wind_x" in named) != bool(stated)
@@ -289,7 +288,7 @@ class TestFlyer:
     def test_wind_and_tilt_are_one_class_where_their_forms_hardly_differ(self, monkeypatch):
         """A tilt that is strongly behind, but by a small part of what the wind is worth."""
         model = self.in_wind(monkeypatch, 0.3, drag=0.01, wind=4.0, beat=0.01, noise=2e-3)
-        found = diagnose_flights.explain(model, laws=False)
+        found = explain_without_laws(model)
         assert found["wind_x"].verdict == found["frame_tilt_y"].verdict == result.CLASS
         assert found["wind_x"].estimate == approx(4.0, rel=0.1)
         assert "frame_tilt_y" in found["wind_x"].partners
@@ -312,7 +311,7 @@ class TestFlyer:
         logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]
         model = FlyerModel(logs, replace(FLYER, command_delay=LATE))
         model.choose(["thrust_gain", "thrust_curve", "rotor_drag_xy", "cmd_delay"])
-        text = summary(diagnose_flights.explain(model, laws=False))
+        text = summary(explain_without_laws(model))
         event = next(line for line in text.splitlines() if line.startswith("EVENT"))
         size = re.fullmatch(
             r"EVENT +flight 3 differs from the others in thrust_gain by (.+)", event

@@ -11,7 +11,7 @@ from pytest import approx, fixture, mark, raises
 
 from tests.commands import run_command
 from tests.places import DATA
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
@@ -20,7 +20,7 @@ from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blind, explain_cli, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
-from visthrow.diagnose.select import diagnose_flights, result
+from visthrow.diagnose.select import result
 from visthrow.diagnose.throw.landing import PredictedLandings
 from visthrow.view import page
 
@@ -55,7 +55,7 @@ class Throwing(SyntheticModel):
 @fixture(scope="module")
 def found():
     model = Throwing(truth=TRUTH, seed=1)
-    return model, diagnose_flights.explain(model, laws=False)
+    return model, explain_without_laws(model)
 
 
 def test_landings_are_told_in_millimetres(found, measured):
@@ -122,7 +122,7 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
 def degenerate():
     same = {"effect_07": ("effect_03", 0.5)}
     model = SyntheticModel(truth={"effect_03": 12.0}, same=same, seed=2)
-    return diagnose_flights.explain(model, laws=False)
+    return explain_without_laws(model)
 
 
 def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
@@ -188,7 +188,7 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
         truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
     )
     model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
-    assert diagnose_flights.explain(model, laws=False)["effect_03"].verdict == result.FOUND
+    assert explain_without_laws(model)["effect_03"].verdict == result.FOUND
 
 
 @mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1,effect_07=1"])

@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
-from tests.synthetic_diagnosis import SyntheticModel
+from tests.synthetic_diagnosis import SyntheticModel, explain_without_laws
 from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.apply import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import diagnose_flights, result, verdicts
+from visthrow.diagnose.select import result, verdicts
 from visthrow.diagnose.select.candidates import (
     DAY,
     FLIGHT,
@@ -254,7 +254,7 @@ def test_what_flights_have_of_their_own_is_integrated_out():
 @mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
     sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
-    diagnosis = diagnose_flights.explain(drawn(sizes, seed=seed), laws=False)
+    diagnosis = explain_without_laws(drawn(sizes, seed=seed))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("cmd_delay",)
     found, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
@@ -268,7 +268,7 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
 
 def test_an_effect_that_varies_about_nothing_is_not_named():
     sizes = 6.0 * default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
-    diagnosis = diagnose_flights.explain(drawn(sizes, seed=5), laws=False)
+    diagnosis = explain_without_laws(drawn(sizes, seed=5))
     assert not diagnosis.theta
     assert delay_jitter(diagnosis).found
     mean = delay_jitter(diagnosis).mean["cmd_delay"]

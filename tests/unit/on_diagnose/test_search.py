@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark, raises
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -62,7 +62,7 @@ def test_nothing_is_found_where_nothing_is():
 @mark.parametrize("sign", [1.0, -1.0])
 def test_one_effect_is_named_with_its_size_and_interval(sign):
     model = world(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert diagnosis.overall == result.KNOWN
     found = diagnosis["effect_03"]
     assert found.verdict == result.FOUND
@@ -80,7 +80,7 @@ TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
 def test_three_effects_are_named_also_where_bends_would_fake_one(curvature):
     """A bend of 2 at 30 floors is taken for more than a third of each size."""
     model = world(truth=TRIPLE, seed=1, curvature=curvature)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert set(diagnosis.named) == set(TRIPLE)
     for name, size in sizes(model, diagnosis).items():
         assert abs(size - TRIPLE[name]) < 1.5
@@ -105,7 +105,7 @@ def hiding(own: float, **options) -> SyntheticModel:
 @mark.parametrize("beside", [{}, {"effect_04": 10.0}])
 def test_two_effects_that_hide_each_other_are_named_together(beside):
     """Neither brings a single nat alone, nor does what looks like both."""
-    diagnosis = diagnose_flights.explain(hiding(0.15, truth=beside), laws=False)
+    diagnosis = explain_without_laws(hiding(0.15, truth=beside))
     assert set(diagnosis.named) == {"effect_03", "effect_07", *beside}
     for name in ("effect_03", "effect_07"):
         assert diagnosis[name].low < 14.0 * diagnosis[name].floor < diagnosis[name].high
@@ -116,7 +116,7 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
 
 def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     model = world(truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     group = [f for f in diagnosis.findings if f.verdict == result.CLASS]
     assert {f.name for f in group} == {"effect_03", "effect_07"}
     assert all(set(f.partners) == {"effect_03", "effect_07"} - {f.name} for f in group)
@@ -132,7 +132,7 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model.effects = tuple(
         replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS
     )
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert diagnosis["effect_05"].verdict == result.UNOBSERVABLE
     assert diagnosis["effect_05"].missing == ("battery_voltage",)
     assert diagnosis.named == ("effect_03",)
@@ -140,7 +140,7 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
 
 def test_what_happened_in_one_flight_is_an_event_and_no_cause():
     model = altered(lambda m, w: pushed(m, w, 40.0) if w.flight == 4 else w, throws=9)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert diagnosis.events == (4,)
     assert [set(names) for names, _ in diagnosis.sets] == [{"effect_03 in flight 4"}]
@@ -158,12 +158,12 @@ def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, ev
         return replace(window, residual=window.residual + window.latent[:, along] @ push)
 
     model = altered(stirred, seed=3, throws=9, gust=0.0, rate=200)
-    assert diagnose_flights.explain(model, laws=False).events == events
+    assert explain_without_laws(model).events == events
 
 
 def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [
         ("effect_03_by_flight", ("effect_03",))
@@ -204,14 +204,14 @@ def test_what_flights_share_and_what_each_has_for_itself_are_weighed_alike(sizes
 
 
 def test_gusts_are_no_causes():
-    assert not diagnose_flights.explain(world(gust=2.0, seed=7), laws=False).theta
+    assert not explain_without_laws(world(gust=2.0, seed=7)).theta
 
 
 def test_causes_at_their_floors_are_not_named():
     signs = default_rng(3).choice([-1.0, 1.0], len(EFFECTS))
     truth = {e.name: sign for e, sign in zip(EFFECTS, signs)}
     model = world(truth=truth, seed=3, gust=0.3, noise=0.5)
-    assert not diagnose_flights.explain(model, laws=False).theta
+    assert not explain_without_laws(model).theta
 
 
 def test_commands_of_other_flights_are_inconsistent_data():
@@ -234,7 +234,7 @@ def test_a_few_windows_that_fail_are_left_out_and_counted():
         lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
         truth={"effect_03": 10.0},
     )
-    diagnosis = diagnose_flights.explain(some, laws=False)
+    diagnosis = explain_without_laws(some)
     assert diagnosis.named == ("effect_03",)
     windows = some.windows({})
     failed = sum(w.flight == 5 for w in windows)
@@ -247,7 +247,7 @@ def test_an_estimate_stays_within_its_physical_bounds():
     model.effects = tuple(
         replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS
     )
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert all(
         f.low >= -5 * floor - 1e-12 and f.high <= 8 * floor + 1e-12
         for f in diagnosis.findings
@@ -263,7 +263,7 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     model.effects = tuple(
         replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS
     )
-    found = diagnose_flights.explain(model, laws=False)["effect_03"]
+    found = explain_without_laws(model)["effect_03"]
     assert found.verdict == result.BOUNDED
     assert (found.low, found.high) == (0.0, 0.0)
     assert (
@@ -380,7 +380,7 @@ def test_a_window_that_no_force_explains_is_left_out():
         )
 
     model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert diagnosis.windows == len(model.windows({})) - 1
     assert tuple(diagnosis.theta) == ("effect_03",)
 
@@ -413,6 +413,6 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     for w in model._windows:
         w.effects[:, 1] = w.latent @ model._law(w.knots) if w.phase == "throw" else 0.0
         w.residual[:] += 0.02 * w.effects[:, 1]
-    diagnosis = diagnose_flights.explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert diagnosis.named == ("effect_01",)
     assert diagnosis["effect_01"].estimate == approx(0.02, abs=1e-3)

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.select import diagnose_flights
+from tests.synthetic_diagnosis import SyntheticModel, catalogue, explain_without_laws
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = tuple(replace(e, switch=i == 3) for i, e in enumerate(catalogue(6)))
@@ -41,9 +40,7 @@ def test_another_kind_of_block_must_explain_the_flights_itself():
     """
     floor = EFFECTS[3].floor
     truth = {"effect_03": 1.0 / floor}
-    assert diagnose_flights.explain(
-        SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False
-    ).named == ("effect_03",)
-    assert not diagnose_flights.explain(
-        Promising(effects=EFFECTS, truth=truth, seed=4), laws=False
-    ).named
+    assert explain_without_laws(SyntheticModel(effects=EFFECTS, truth=truth, seed=4)).named == (
+        "effect_03",
+    )
+    assert not explain_without_laws(Promising(effects=EFFECTS, truth=truth, seed=4)).named

@@ -17,6 +17,7 @@ from sim.effects.setting import AERODYNAMICS, generalised
 from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
+from tests.synthetic_diagnosis import explain_without_laws
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
@@ -333,11 +334,11 @@ def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
     """It was: with nothing hidden, thrust 0.7 % too high was named. The voltage tells."""
     names = ["thrust_gain", "air_density", "mass_quad"]
     logs = fly(setting_with({}), used=0.0, throws=0, seconds=2.6)
-    assert not explain(ThrowModel(logs, paper_plant(), only=names), laws=False).theta
+    assert not explain_without_laws(ThrowModel(logs, paper_plant(), only=names)).theta
     for log in logs:
         del log.channels["battery_voltage"]
     model = ThrowModel(logs, paper_plant(), only=[*names, "battery_charge"])
-    diagnosis = explain(model, laws=False)
+    diagnosis = explain_without_laws(model)
     assert set(diagnosis.theta) == {"battery_charge"}
     found = diagnosis["battery_charge"]
     assert found.low < (16.8 - 16.18) / 15.2 < found.high  # open voltage: full, a fifth used

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 from scipy.spatial.transform import Rotation
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue, explain_without_laws
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import with_latent_effects
@@ -348,7 +348,7 @@ def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
 def test_the_table_takes_up_what_no_name_explains():
     """Weights from some flights predict the hidden drag in a flight that they have not seen."""
     model = SyntheticModel(law="speed", law_size=0.02, seed=3, throws=12)
-    point = diagnose_flights.explain(model, laws=False).work.before
+    point = explain_without_laws(model).work.before
     table = table_of(point, default_rng(0))
     flights = [w.flight for w in point.windows]
     trained = train(point, table, flights)
