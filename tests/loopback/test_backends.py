@@ -67,6 +67,12 @@ class Desk:
             self.turn(0.02, HOVER, FOLLOW)
         raise AssertionError(self.status)
 
+    def abort(self):
+        """Ask for the end of the flight at each tick for a while."""
+        for _ in range(20):
+            self.turn(0.02)
+            self.backend.abort(self.now)
+
 
 def test_of_an_autopilot_that_says_much_the_newest_words_are_kept():
     """The newest word is the reason why it is not armed."""
@@ -146,9 +152,7 @@ def test_hands(kind):
     assert (desk.status.connected, desk.status.mode) == (False, WAIT)
     assert "did not ask for: pilot or failsafe has it" in desk.status.note
     mode = desk.fake.mode
-    for _ in range(20):
-        desk.turn(0.02)
-        desk.backend.abort(desk.now)
+    desk.abort()
     assert desk.fake.mode == mode, "an abort does not take it out of the pilot's hands"
 
 
@@ -156,9 +160,7 @@ def test_hands(kind):
 def test_an_abort_lands(kind):
     desk = Desk(kind).follow()
     sent = desk.source.links[0].sent
-    for _ in range(20):
-        desk.turn(0.02)
-        desk.backend.abort(desk.now)
+    desk.abort()
     assert desk.source.links[0].sent - sent <= 20, "it does not ask at every tick"
     assert desk.status.mode == LAND
     assert desk.fake.mode == (9 if kind == "ardupilot" else PX4_LAND)
@@ -175,9 +177,7 @@ def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
     hold = 17 if kind == "ardupilot" else custom(4, 3)
     desk.fake.enter(hold)
     desk.fake._next_beat = 0.0
-    for _ in range(20):
-        desk.turn(0.02)
-        desk.backend.abort(desk.now)
+    desk.abort()
     assert desk.status.mode == LAND
 
 
@@ -319,6 +319,7 @@ def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
     wrong = [line for line in table.splitlines() if line.startswith("WRONG")]
     assert len(wrong) == 1
     assert name in wrong[0]
+    assert "--write-parameters" in table
     assert not desk.status.connected
     assert f"parameter audit: {name} wrong" in desk.status.fault
     assert any(text.startswith(f"{name} is ") for text in desk.backend.audit.problems)
@@ -349,6 +350,13 @@ AUDITED = [
     # a second of the last rates is too long
     ("ardupilot", "", {"GUID_TIMEOUT": 1.0}, ["GUID_TIMEOUT is 1; expected above 0, at most 0.5"]),
     ("px4", "", {"COM_OF_LOSS_T": 1.0}, ["COM_OF_LOSS_T is 1; expected above 0, at most 0.5"]),
+    (
+        "ardupilot",
+        "",
+        {"GUID_OPTIONS": 5.0},
+        ["GUID_OPTIONS is 5; expected with the bits of 8 set"],
+    ),
+    ("ardupilot", "", {"ATC_ANGLE_BOOST": float("nan")}, ["ATC_ANGLE_BOOST is nan; expected 0"]),
     # older firmware answers no DO_GRIPPER without it
     ("px4", "", {"PD_GRIPPER_EN": 0.0}, ["PD_GRIPPER_EN is 0; expected 1, or none since 1.17"]),
     # the closed end taken for the open one

@@ -7,6 +7,7 @@ from pytest import approx, mark
 
 from tests.hil_flight import AT_ONCE, NEVER, AutoOperator
 from tests.level import LevelPlant
+from tests.loopback.test_autopilot_faults import when
 from tests.loopback.wire import QUICK, cut, peers
 from tests.mocap_faults import FAULTS
 
@@ -47,10 +48,6 @@ def spoiled(name: str):
     )
     cut(runner, source, clock, AutoOperator(), None, START + 0.7, told.append)
     return runner, fake, [(d.state, d.reason, d.time) for d in told]
-
-
-def when(told, state: str) -> float:
-    return next(time for name, _, time in told if name == state)
 
 
 @mark.parametrize("name", sorted(FAULTS))

@@ -177,14 +177,6 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
     assert "landed" in capsys.readouterr().out
 
 
-def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
-    assert train(tmp_path / "a", "--from", "vision") == 2
-    message = capsys.readouterr().err
-    assert "--from" in message
-    assert "observation.layout" in message
-    assert not (tmp_path / "a").exists()
-
-
 @mark.parametrize(
     ("extra", "said"),
     [
@@ -195,7 +187,9 @@ def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
         (["--set", "rope.length=-0.2"], "length"),
         (["--set", "ppo.epochs=0"], "epochs is 0; expected 1 or more"),
         (["--set", "ppo.learning_rate=-1e-3"], "learning_rate is -0.001"),
+        (["--set", "ppo.minibatches=7"], "minibatches"),
         (["--resume", "--from", "state"], "--from"),
+        (["--from", "vision"], "observation.layout"),
     ],
 )
 def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(tmp_path, refused, extra, said):
@@ -267,11 +261,6 @@ def test_resume_under_another_seed_or_configuration_is_refused(tmp_path, refused
         f"train vision --resume --out {folder} --device cpu",
         said="another configuration than vision",
     )
-
-
-def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, refused):
-    refused(f"train stat --out {tmp_path}/a", said="state")
-    refused(*words(tmp_path / "b", "--set", "ppo.minibatches=7"), said="minibatches")
 
 
 def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, printed):

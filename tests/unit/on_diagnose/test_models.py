@@ -65,6 +65,8 @@ FLYER = FlyerParams(
     drag_z=0.0,
     lowest=-10.0,
 )
+LATE_FLYER = replace(FLYER, command_delay=LATE)
+DRIVEN_BY_THRUST = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0))
 TORQUE = TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
 IMU = ImuParams(**QUADROTOR, step=0.01, torque=TORQUE)
 
@@ -175,6 +177,11 @@ class TestStand:
         assert len(record["logs"]) == 3
 
 
+def level_log(time: np.ndarray, pos_w: np.ndarray) -> FlightLog:
+    """Return a log of a vehicle that stays level."""
+    return log_at(time, pos_w=pos_w, quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)))
+
+
 class TestFlyer:
     @mark.parametrize("params", [FLYER, IMU], ids=["flyer", "imu"])
     @mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
@@ -188,24 +195,14 @@ class TestFlyer:
         integration that one comes.
         """
         rng, tau, mass = default_rng(3), 0.03, 0.03
-        params = replace(
-            FLYER,
-            input="thrust_command",
-            thrust_map=(0.0, 1.0, 0.0),
-            mass=mass,
-            motor_time_constant=tau,
-        )
+        params = replace(DRIVEN_BY_THRUST, mass=mass, motor_time_constant=tau)
         time = np.arange(0.0, 4.0, 0.01)
         sent = np.arange(-phase, 4.0, 0.01)
         told = mass * G * (1.0 + 0.3 * rng.normal(size=len(sent)))
         since = np.maximum(time[:, None] - sent[1:], 0.0)
         rises = 0.5 * since**2 - tau * since + tau**2 * (1.0 - np.exp(-since / tau))
         height = 5.0 + 0.5 * (told[0] / mass - G) * time**2 + rises @ np.diff(told) / mass
-        log = log_at(
-            time,
-            pos_w=np.outer(height, [0.0, 0.0, 1.0]),
-            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
-        )
+        log = level_log(time, np.outer(height, [0.0, 0.0, 1.0]))
         log = with_channels(log, thrust_command=Channel(sent, told[:, None], "N"))
         off = np.concatenate(FlyerModel([log], params).residuals({}))
         assert np.abs(off).max() < 1e-4  # motion capture has more noise
@@ -213,11 +210,10 @@ class TestFlyer:
     def test_a_cable_is_attached_where_its_setup_says(self):
         mount = (0.01, 0.0, -0.03)
         log = fly(4.0, cable=0.5, mount=mount, noise=1e-6)
-        params = replace(FLYER, command_delay=LATE, drag_xy=0.0)
         worst = []
         for point in (mount, (0.0, 0.0, 0.0)):
             cable = CableParams(0.5, 0.008, point)
-            model = FlyerModel([log], replace(params, cable=cable))
+            model = FlyerModel([log], replace(LATE_FLYER, cable=cable))
             worst.append(np.abs(np.concatenate(model.residuals({}))).max())
             assert np.allclose(model.windows({})[0].knots["mount_b"], point, rtol=0.0, atol=1e-12)
         assert worst[0] < 1e-4
@@ -242,19 +238,19 @@ class TestFlyer:
 
     def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
         logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
-        diagnosis = diagnose_flights.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        diagnosis = diagnose_flights.explain(FlyerModel(logs, LATE_FLYER))
         assert diagnosis.overall == "UNKNOWN"
         assert diagnosis.laws[0].formula == "F = c 1/d d_z/d z"
         law = diagnosis.laws[0]
         assert law.coefficient == approx(0.03, rel=0.02)
         for log in logs:
             del log.channels["neighbour_pos_w"]
-        unaware = diagnose_flights.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        unaware = diagnose_flights.explain(FlyerModel(logs, LATE_FLYER))
         assert all("/d" not in law.formula for law in unaware.laws)
 
     def test_what_neither_name_nor_law_explains_is_told(self):
         logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
-        diagnosis = explain_without_laws(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        diagnosis = explain_without_laws(FlyerModel(logs, LATE_FLYER))
         assert diagnosis.overall in ("UNKNOWN", "EXPLAINED IN PART")
         assert any("noise alone" in reason for reason in diagnosis.reasons)
 
@@ -309,7 +305,7 @@ class TestFlyer:
 
     def test_a_flight_whose_thrust_differs_says_what_and_by_how_much(self):
         logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]
-        model = FlyerModel(logs, replace(FLYER, command_delay=LATE))
+        model = FlyerModel(logs, LATE_FLYER)
         model.choose(["thrust_gain", "thrust_curve", "rotor_drag_xy", "cmd_delay"])
         text = summary(explain_without_laws(model))
         event = next(line for line in text.splitlines() if line.startswith("EVENT"))
@@ -351,15 +347,9 @@ class TestFlyer:
     def test_effects_push_a_hovering_vehicle_as_their_equations_say(self, name, size, expected):
         """Closed form: half the acceleration that an effect makes times the time squared."""
         time = np.arange(0.0, 3.0, 0.01)
-        none = np.zeros(len(time))
-        log = log_at(
-            time,
-            pos_w=np.column_stack([none, none, none + 2.0]),
-            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
-        )
-        weight = Channel(time, none[:, None] + FLYER.mass * G, "N")
-        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0))
-        model = FlyerModel([with_channels(log, thrust_command=weight)], params)
+        log = level_log(time, np.tile([0.0, 0.0, 2.0], (len(time), 1)))
+        weight = Channel(time, np.full(len(time), FLYER.mass * G), "N")
+        model = FlyerModel([with_channels(log, thrust_command=weight)], DRIVEN_BY_THRUST)
         seen = []
         for theta in ({}, {name: size}):
             lanes = model._lanes(model.size(theta))
@@ -373,12 +363,11 @@ class TestFlyer:
     def test_a_neighbour_is_measured_in_the_tilted_frame_too(self):
         time = np.arange(0.0, 3.0, 0.01)
         place = np.tile([3.0, 0.0, 2.0], (len(time), 1))
-        log = log_at(time, pos_w=place, quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)))
+        log = level_log(time, place)
         above = Channel(time, place + [0.0, 0.0, 1.0], "m", "world")
         weight = Channel(time, np.full((len(time), 1), FLYER.mass * G), "N")
-        params = replace(FLYER, input="thrust_command", thrust_map=(0.0, 1.0, 0.0))
         log = with_channels(log, thrust_command=weight, neighbour_pos_w=above)
-        model = FlyerModel([log], params)
+        model = FlyerModel([log], DRIVEN_BY_THRUST)
         lanes = model._lanes(model.size({"frame_tilt_y": 0.05}))
         (knots, *_) = model.knots(lanes, model.simulate(lanes))
         begins = knots["pos_w"][0] - knots["neighbour_pos_w"][0]
@@ -387,19 +376,9 @@ class TestFlyer:
     @mark.parametrize("step", [0.02, 0.03, 0.06])
     def test_thrusts_keep_their_time_where_no_number_of_steps_fills_the_window(self, step):
         time = np.arange(0.0, 4.0, 0.01)
-        log = log_at(
-            time,
-            pos_w=np.tile([0.0, 0.0, 2.0], (len(time), 1)),
-            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
-        )
+        log = level_log(time, np.tile([0.0, 0.0, 2.0], (len(time), 1)))
         rising = Channel(time, FLYER.mass * G * (1.0 + 0.1 * time[:, None]), "N")
-        params = replace(
-            FLYER,
-            input="thrust_command",
-            thrust_map=(0.0, 1.0, 0.0),
-            motor_time_constant=0.001,
-            step=step,
-        )
+        params = replace(DRIVEN_BY_THRUST, motor_time_constant=0.001, step=step)
         model = FlyerModel([with_channels(log, thrust_command=rising)], params)
         driven = model._commands(model._lanes(model.size({})))
         since = driven["command_time"][0] + 0.5 * model.row

@@ -65,27 +65,45 @@ def matlab(path: Path) -> None:
     )
 
 
-def mcap(path: Path) -> None:
+def write_mcap(path: Path, topics: dict[str, str], messages: list[tuple[str, int, bytes]]) -> None:
+    """Write messages (topic, stamp [ns], data) of topics with an encoding each."""
     writer_of = importorskip("mcap.writer")
     with path.open("wb") as file:
         writer = writer_of.Writer(file)
         writer.start()
         schema = writer.register_schema(name="any", encoding="jsonschema", data=b"{}")
-        topics = {
-            name: writer.register_channel(
-                topic=f"/{name}", message_encoding="json", schema_id=schema
-            )
-            for name in ("pose", "imu")
+        numbers = {
+            name: writer.register_channel(f"/{name}", encoding, schema)
+            for name, encoding in topics.items()
         }
-        for i, t in enumerate(TIME):
-            stamp = round(1e9 * t) + 1_700_000_000_000_000_000
-            for name, value in (
-                ("pose", {"position": dict(zip("xyz", COLUMNS["pos_w"][i]))}),
-                ("imu", {"acc": dict(zip("xyz", COLUMNS["acc_b"][i]))}),
-            ):
-                if name == "imu" or i % 2:
-                    writer.add_message(topics[name], stamp, json.dumps(value).encode(), stamp)
+        for name, stamp, data in messages:
+            writer.add_message(numbers[name], stamp, data, stamp)
         writer.finish()
+
+
+def mcap(path: Path) -> None:
+    messages = []
+    for i, t in enumerate(TIME):
+        stamp = round(1e9 * t) + 1_700_000_000_000_000_000
+        for name, value in (
+            ("pose", {"position": dict(zip("xyz", COLUMNS["pos_w"][i]))}),
+            ("imu", {"acc": dict(zip("xyz", COLUMNS["acc_b"][i]))}),
+        ):
+            if name == "imu" or i % 2:
+                messages.append((name, stamp, json.dumps(value).encode()))
+    write_mcap(path, {"pose": "json", "imu": "json"}, messages)
+
+
+@mark.parametrize("others", [["protobuf"], ["cbor", "protobuf"], []])
+def test_topics_that_cannot_be_decoded_are_named_and_the_rest_is_read(others, tmp_path):
+    path = tmp_path / "a.mcap"
+    messages = [("json", i, json.dumps({"values": [i, 2 * i]}).encode()) for i in range(60)]
+    messages += [(other, i, b"\xff") for other in others for i in range(60)]
+    write_mcap(path, {name: name for name in ("json", *others)}, messages)
+    table = table_of(path)
+    assert table["json:values[1]"].tolist() == [2.0 * i for i in range(60)]
+    assert len(table.left_out) == len(others)
+    assert all(any(other in part for part in table.left_out) for other in others)
 
 
 def bag(path: Path, ros: int = 1) -> None:

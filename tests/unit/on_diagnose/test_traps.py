@@ -2,20 +2,20 @@
 free of it; a channel that is empty or in another unit is refused before anything is named.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from pytest import approx, mark, raises
 
+from bench.diagnose.altered import with_values
+from tests.flightlogs import with_channels
 from tests.places import DATA
 from visthrow.common.errors import LogError
-from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers import table
 
 REAL = DATA / "real"
@@ -25,28 +25,20 @@ FLIGHTS = (204, 205, 206)
 
 @cache
 def recorded(number: int) -> FlightLog:
-    return setup.read_logs([REAL / "payload_cf_single" / f"log{number}.csv.gz"], "cf_payload")[0]
+    return setups.read_logs([REAL / "payload_cf_single" / f"log{number}.csv.gz"], "cf_payload")[0]
 
 
-CRAZYFLIE = setup.known("cf_payload")
+CRAZYFLIE = setups.known("cf_payload")
 PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 LATE = 0.1
 
 
 def changed(log: FlightLog, names, change) -> FlightLog:
-    channels = {
-        n: Channel(c.time, change(c.values.astype(float)), c.unit, c.frame, c.valid)
-        for n in names
-        for c in [log[n]]
-    }
-    return FlightLog({**log.channels, **channels}, log.meta)
+    return with_values(log, dict.fromkeys(names, change))
 
 
 def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
-    channels = {
-        n: Channel(c.time + by, c.values, c.unit, c.frame, c.valid) for n in names for c in [log[n]]
-    }
-    return FlightLog({**log.channels, **channels}, log.meta)
+    return with_channels(log, **{n: replace(log[n], time=log[n].time + by) for n in names})
 
 
 def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
@@ -91,9 +83,7 @@ def test_late_streams_are_named_with_their_offset(streams, row):
 
 
 def test_thrust_of_another_flight_is_refused():
-    found = bad(
-        FlightLog({**recorded(205).channels, "thrust_command": recorded(204)["thrust_command"]})
-    )
+    found = bad(with_channels(recorded(205), thrust_command=recorded(204)["thrust_command"]))
     assert "the force does not follow the thrust" in found
     assert "thrust of another flight" in found
 
@@ -144,37 +134,22 @@ def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
     assert any("the thrust's scale differs from flight to flight" in text for text in texts)
 
 
-CABLE = ("cf_payload", "real/payload_cf_single/log206.csv.gz")
-
-
-def model(setup: str, path: str, change: Callable[[table.Table], dict]):
-    """Of a table with some columns changed."""
-    chosen, columns = setups.load(setup), table.read_table(DATA / path)
-    return setups.model_of(chosen, table.logs_of(columns | change(columns), chosen.table, path))
-
-
-def nothing(*names: str) -> Callable[[table.Table], dict]:
-    """Columns without a number."""
-    return lambda t: {name: np.full(len(t[name]), np.nan) for name in names}
-
-
-def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
-    """Columns in another unit."""
-    return lambda t: {name: factor * t[name] for name in names}
-
-
 @mark.parametrize(
-    ("data", "change", "words"),
+    ("names", "factor", "words"),
     [
         (
-            CABLE,
-            nothing(*(f"stateEstimateZ.p{axis}" for axis in "xyz")),
+            [f"stateEstimateZ.p{axis}" for axis in "xyz"],
+            np.nan,
             "missing everywhere: payload_pos_w",
         ),
-        (CABLE, times(1e3, "ctrlLee.thrustSI"), "times the weight"),
+        (["ctrlLee.thrustSI"], 1e3, "times the weight"),
     ],
 )
-def test_spoiled_channels_are_refused(data, change, words):
-    assert model(*data, lambda _: {}).stretches  # as it is, it can be looked at
+def test_spoiled_channels_are_refused(names, factor, words):
+    chosen = setups.load("cf_payload")
+    columns = table.read_table(REAL / "payload_cf_single" / "log206.csv.gz")
+    spoiled = {name: factor * columns[name] for name in names}
+    logs = [table.logs_of(one, chosen.table, "log206") for one in (columns, columns | spoiled)]
+    assert setups.model_of(chosen, logs[0]).stretches  # as it is, it can be looked at
     with raises(LogError, match=words):
-        model(*data, change)
+        setups.model_of(chosen, logs[1])

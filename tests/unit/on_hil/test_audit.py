@@ -2,7 +2,7 @@
 the release's book-keeping.
 """
 
-from pytest import approx, mark
+from pytest import approx
 
 from hil.links.backends.audit import (
     GIVE_UP,
@@ -50,24 +50,6 @@ def audit(values, write=False):
         box[0].service(now)
         now += 0.02
     return box[0], asked, written, tables, now
-
-
-@mark.parametrize(
-    ("name", "value", "text"),
-    [
-        ("GUID_OPTIONS", 5.0, "GUID_OPTIONS is 5; expected with the bits of 8 set"),
-        ("ATC_ANGLE_BOOST", 1.0, "ATC_ANGLE_BOOST is 1; expected 0"),
-        ("GUID_TIMEOUT", 3.0, "GUID_TIMEOUT is 3; expected above 0, at most 0.5"),
-        ("GUID_TIMEOUT", 0.0, "GUID_TIMEOUT is 0; expected above 0, at most 0.5"),
-        ("FIXED", float("nan"), "FIXED is nan; expected 7"),
-    ],
-)
-def test_a_mismatch_is_named(name, value, text):
-    found, _, written, tables, _ = audit({**GOOD, name: value})
-    assert (found.problems, written) == ([text], []), "and nothing is written unasked"
-    (line,) = [line for line in tables[0].splitlines() if line.startswith("WRONG")]
-    assert name in line
-    assert "--write-parameters" in tables[0]
 
 
 def test_a_parameter_that_is_not_told_is_a_mismatch():

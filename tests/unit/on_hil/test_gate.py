@@ -24,6 +24,13 @@ def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
     return Pose(time, time if arrival is None else arrival, "vehicle", (x, 0.0, 1.0), quat, **more)
 
 
+def begun() -> Gate:
+    """Return a gate that has taken a pose."""
+    gate = Gate(PARAMS)
+    assert gate.check(pose()) is None
+    return gate
+
+
 @mark.parametrize(
     ("second", "reason"),
     [
@@ -41,8 +48,7 @@ def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
     ],
 )
 def test_each_reason(second, reason):
-    gate = Gate(PARAMS)
-    assert gate.check(pose()) is None
+    gate = begun()
     assert gate.check(second, (0.0, 0.0, 0.0)) == reason
     assert gate.refused == ({} if reason is None else {reason: 1})
 
@@ -64,25 +70,21 @@ def turned(angle: float, norm: float = 1.0):
 )
 def test_limits_just_inside_and_just_outside(at, limit, reason):
     for share, expected in ((0.999, None), (1.001, reason)):
-        gate = Gate(PARAMS)
-        gate.check(pose())
+        gate = begun()
         assert gate.check(at(share * limit), (0.0, 0.0, 0.0)) == expected
 
 
 def test_without_a_velocity_the_largest_speed_bounds_the_way():
     for x, expected in ((0.199, None), (0.201, "speed")):
-        gate = Gate(PARAMS)
-        gate.check(pose())
+        gate = begun()
         assert gate.check(pose(0.01, x)) == expected
 
 
 def test_a_swapped_body_is_never_taken_back_by_waiting():
-    gate = Gate(PARAMS)
-    gate.check(pose())
+    gate = begun()
     reasons = {gate.check(pose(0.01 * i, 0.4), (0.0, 0.0, 0.0)) for i in range(1, 3)}
     assert reasons <= {"jump", "speed"}
-    gate = Gate(PARAMS)
-    gate.check(pose(), None)
+    gate = begun()
     assert gate.check(pose(0.01, 0.01, reset=1)) == "reset"
     assert gate.check(pose(0.02, 0.02)) == "reset", "also when the counter goes back"
     gate.restart()
@@ -93,15 +95,13 @@ def test_a_swapped_body_is_never_taken_back_by_waiting():
 def test_bodies_swapped_after_a_gap_are_known_by_the_cable(gap):
     """After 0.13 s without poses the room for a jump is wider than the cable is long."""
     still, tether = (0.0, 0.0, 0.0), Tether((0.43, 0.0, 1.0), 0.6)
-    gate = Gate(PARAMS)
-    gate.check(pose())
+    gate = begun()
     swapped = pose(gap, 0.43)
     assert gate.check(swapped, still, tether) == "swapped"
     assert gate.check(pose(gap + 0.01, 0.431), still, tether) == "swapped", "nor by waiting"
     assert gate.check(pose(gap + 0.02, 0.02), still, tether) is None, "back in its own place"
     if gap > 0.1:
-        gate = Gate(PARAMS)
-        gate.check(pose())
+        gate = begun()
         assert gate.check(swapped, still) is None, "without the cable it would have been taken"
 
 
@@ -110,8 +110,7 @@ def test_a_body_farther_off_than_the_cable_is_long():
     is followed, whatever has come off.
     """
     still, gap = (0.0, 0.0, 0.0), 0.1
-    gate = Gate(PARAMS)
-    gate.check(pose())
+    gate = begun()
     assert gate.check(pose(gap, 0.2), still, Tether((-0.5, 0.0, 1.0), 0.69)) == "cable"
     assert gate.check(pose(gap + 0.01, 0.05), still, Tether((-0.5, 0.0, 1.0), 0.54)) is None, (
         "where it was to be"

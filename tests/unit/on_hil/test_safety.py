@@ -74,10 +74,15 @@ def test_a_payload_that_flies_is_not_watched():
     assert box_violation((0.0, 0.0, 0.0), (-1.0,) * 3, (1.0,) * 3) is None
 
 
+def guard_of(thrust: float, rate: tuple[float, float, float]) -> Guard:
+    """Return a guard of a 14 N vehicle that limits the change of commands."""
+    return Guard(GuardParams(slew_thrust=thrust, slew_rate=rate), 14.0, (10.0, 9.0, 8.0))
+
+
 @mark.parametrize("axis", range(4))
 @mark.parametrize("side", [-1, 1])
 def test_the_guard_limits_each_command_and_its_change(axis, side):
-    guard = Guard(GuardParams(slew_thrust=3.0, slew_rate=(4.0, 5.0, 6.0)), 14.0, (10.0, 9.0, 8.0))
+    guard = guard_of(3.0, (4.0, 5.0, 6.0))
     slew, high = (3.0, 4.0, 5.0, 6.0)[axis], (14.0, 10.0, 9.0, 8.0)[axis]
     low = 0.0 if axis == 0 else -high
     start = [7.0, 0.0, 0.0, 0.0]
@@ -96,7 +101,7 @@ def test_the_guard_limits_each_command_and_its_change(axis, side):
 
 
 def test_after_a_reset_any_command_within_the_limits_passes():
-    guard = Guard(GuardParams(slew_thrust=1.0, slew_rate=(1.0, 1.0, 1.0)), 14.0, (10.0, 9.0, 8.0))
+    guard = guard_of(1.0, (1.0, 1.0, 1.0))
     guard.check((0.0, 0.0, 0.0, 0.0))
     guard.reset()
     assert guard.check((14.0, 10.0, 9.0, 8.0)) == (14.0, 10.0, 9.0, 8.0)
@@ -105,7 +110,7 @@ def test_after_a_reset_any_command_within_the_limits_passes():
 @mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @mark.parametrize("axis", range(4))
 def test_what_is_not_finite_is_refused_and_counted(bad, axis):
-    guard = Guard(GuardParams(slew_thrust=1.0, slew_rate=(1.0, 1.0, 1.0)), 14.0, (10.0, 9.0, 8.0))
+    guard = guard_of(1.0, (1.0, 1.0, 1.0))
     command = [7.0, 0.0, 0.0, 0.0]
     command[axis] = bad
     assert guard.check(tuple(command)) is None

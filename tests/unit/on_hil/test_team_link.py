@@ -21,8 +21,12 @@ from hil.links.team_link import (
 PERIOD = 0.02
 
 
-def pair() -> tuple[Agreement, Agreement]:
-    return Agreement(0, 2), Agreement(1, 2)
+def pair(tick: int = 0) -> tuple[Agreement, Agreement]:
+    """Return two members that have begun a tick."""
+    members = Agreement(0, 2), Agreement(1, 2)
+    for member in members:
+        member.begin(tick)
+    return members
 
 
 def test_all_do_in_one_tick_the_least_that_all_were_ready_for():
@@ -41,9 +45,7 @@ def test_all_do_in_one_tick_the_least_that_all_were_ready_for():
 
 
 def test_a_lost_or_late_word_stands_for_nothing():
-    one, two = pair()
-    for member in (one, two):
-        member.begin(5)
+    one, two = pair(5)
     one.say(RELEASE)
     late = two.say(RELEASE)
     one.begin(6)
@@ -66,9 +68,7 @@ def test_broken_words_and_those_of_another_clock_change_nothing():
 
 
 def test_the_first_word_on_a_tick_counts():
-    one, two = pair()
-    for member in (one, two):
-        member.begin(5)
+    one, two = pair(5)
     one.say(RELEASE)
     one.receive(two.say(THROW), 1)
     one.receive(MESSAGE.pack(MARK, RELEASE, 5), 1)

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 
 import numpy as np
 import pytest
@@ -124,11 +123,11 @@ EXPORTS = {
 def proposed(tmp_path):
     """Function that writes a file; returns its table, what is proposed for it, and its logs."""
 
-    def take(text, name="a.csv", **more):
+    def take(text, name="a.csv"):
         path = tmp_path / name
         path.write_text(text, newline="")
         table = table_of(path)
-        found = propose(table, name, **more)
+        found = propose(table, name)
         return table, found, logs_of(table, found.mapping, name)
 
     return take
@@ -281,42 +280,3 @@ def test_rotor_speeds_are_proposed_as_speeds(proposed):
         _, found, _ = proposed(f"time,x,y,z,{head}\n" + lines(rows))
         (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
         assert entry.unit == unit
-
-
-def test_the_unit_of_time_can_be_told(proposed):
-    text = "t,x,y,z\n" + lines([[1e3 * t, *p] for t, p in zip(TIME, POS)])
-    assert proposed(text, time_unit="ms")[1].mapping.time.unit == "ms"
-
-
-def test_a_log_that_needs_no_mapping_is_sent_to_check(tmp_path):
-    path = tmp_path / "a.ulg"
-    path.write_bytes(b"ULog")
-    with raises(LogError, match="visthrow diagnose check"):
-        table_of(path)
-
-
-def write_mcap(path, encodings):
-    """An MCAP file with a topic of each encoding, two messages each."""
-    writer_of = importorskip("mcap.writer").Writer
-    with path.open("wb") as file:
-        writer = writer_of(file)
-        writer.start()
-        schema = writer.register_schema("a", "jsonschema", b"{}")
-        for encoding in encodings:
-            topic = writer.register_channel(f"/{encoding}", encoding, schema)
-            for i in range(60):
-                data = (
-                    json.dumps({"values": [i, 2 * i]}).encode() if encoding == "json" else b"\xff"
-                )
-                writer.add_message(topic, int(1e7 * i), data, int(1e7 * i))
-        writer.finish()
-
-
-@pytest.mark.parametrize("others", [["protobuf"], ["cbor", "protobuf"], []])
-def test_topics_that_cannot_be_decoded_are_named_and_the_rest_is_read(others, tmp_path):
-    path = tmp_path / "a.mcap"
-    write_mcap(path, ["json", *others])
-    table = table_of(path)
-    assert table["json:values[1]"].tolist() == [2.0 * i for i in range(60)]
-    assert len(table.left_out) == len(others)
-    assert all(any(other in part for part in table.left_out) for other in others)

@@ -19,6 +19,7 @@ from tests import logfiles
 from tests.commands import run_command
 from tests.flightlogs import log_at, with_channels
 from tests.places import DATA
+from tests.unit.on_logs.test_autopilots import ulog, write_tlog
 from visthrow.common.errors import LogError, VisthrowError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
@@ -51,33 +52,6 @@ def patience() -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def ulog(path: Path) -> None:
-    """Position, attitude and rates."""
-    logfiles.write_ulg(
-        path,
-        {
-            ("vehicle_local_position", 0): (
-                ["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
-                [
-                    (20_000 * i, math.sin(0.1 * i), 2.0, -3.0, 5.0 * math.cos(0.1 * i), 0.0, 0.0)
-                    for i in range(SAMPLES)
-                ],
-            ),
-            ("vehicle_attitude", 0): (
-                ["uint64_t timestamp", "float[4] q"],
-                [
-                    (10_000 * i, math.cos(0.05 * i), math.sin(0.05 * i), 0.0, 0.0)
-                    for i in range(SAMPLES)
-                ],
-            ),
-            ("vehicle_angular_velocity", 0): (
-                ["uint64_t timestamp", "float[3] xyz"],
-                [(10_000 * i, 10.0, 0.0, 0.0) for i in range(SAMPLES)],
-            ),
-        },
-    )
-
-
 def dataflash(path: Path) -> None:
     """Rates, accelerations, attitude and position."""
     imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
@@ -93,24 +67,6 @@ def dataflash(path: Path) -> None:
         for i in range(SAMPLES)
     ]
     logfiles.write_bin(path, {"IMU": imu, "ATT": logfiles.ATT, "XKF1": logfiles.XKF1}, rows)
-
-
-def telemetry(path: Path) -> None:
-    """Position and attitude."""
-    from pymavlink.dialects.v20 import common
-
-    sender, data = common.MAVLink(None), b""
-    for i in range(SAMPLES):
-        for message in (
-            common.MAVLink_local_position_ned_message(
-                20 * i, math.sin(0.1 * i), 2.0, -3.0, 0.1, 0.0, 0.5
-            ),
-            common.MAVLink_attitude_message(
-                20 * i, 0.1 * math.sin(0.1 * i), 0.0, 0.0, 0.1, 0.0, 0.0
-            ),
-        ):
-            data += struct.pack(">Q", 1_700_000_000_000_000 + 20_000 * i) + message.pack(sender)
-    path.write_bytes(data)
 
 
 def blackbox(path: Path) -> None:
@@ -143,7 +99,7 @@ def payload_table() -> bytes:
 FORMATS: dict[str, Callable[[Path], object]] = {
     "a.ulg": ulog,
     "a.BIN": dataflash,
-    "a.tlog": telemetry,
+    "a.tlog": lambda path: write_tlog(path, lambda mav, i: []),
     "a.bbl": blackbox,
     "a.npz": lambda path: own().save(path),
     "export.csv": lambda path: export(own(), path),

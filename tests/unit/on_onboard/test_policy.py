@@ -11,7 +11,7 @@ import torch
 from pytest import fixture, mark, raises
 from tensordict import TensorDict
 
-from visthrow.common.errors import MismatchError, PolicyError, VisthrowError
+from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.common.storage import from_json_array, json_array
 from visthrow.onboard.policy import FORMAT_VERSIONS, Policy, find_policy
 
@@ -186,21 +186,6 @@ def test_pickles_are_never_loaded(tmp_path):
         archive.writestr("header.npy", buffer.getvalue())
     with raises(PolicyError, match="pickle"):
         Policy.load(path)
-
-
-def test_a_full_disk_leaves_the_old_file(policy, tmp_path, monkeypatch):
-    path = tmp_path / "p.npz"
-    policy.save(path)
-    before = path.read_bytes()
-
-    def full(fd: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("visthrow.common.storage.os.fsync", full)
-    with raises(VisthrowError, match="No space left on device"):
-        policy.save(path)
-    assert path.read_bytes() == before
-    assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
 
 
 def test_states_of_other_networks_are_refused():

@@ -86,11 +86,6 @@ def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, refu
     )
 
 
-def test_fly_refuses_another_rope_unless_it_is_allowed(tmp_path, refused):
-    words = f"fly --policy state --device cpu --out {tmp_path} --set rope.length=0.4"
-    refused(words, said="--allow rope.length")
-
-
 def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, refused):
     refused(
         f"fly --out {tmp_path} --set task.noise.command_step=0",
