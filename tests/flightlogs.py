@@ -34,6 +34,12 @@ def log_at(time: np.ndarray, **columns: np.ndarray) -> FlightLog:
     return FlightLog({n: Channel(time, values, *UNITS[n]) for n, values in columns.items()})
 
 
+def level_log(time: np.ndarray, pos_w: np.ndarray, **columns: np.ndarray) -> FlightLog:
+    """Return a log of a vehicle that stays level, and of further columns."""
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
+    return log_at(time, pos_w=pos_w, quat_wb=level, **columns)
+
+
 def log_of(columns: dict[str, np.ndarray], **channels: Channel) -> FlightLog:
     """Return a log of columns over their column of time [s], and of further channels."""
     others = {name: values for name, values in columns.items() if name != "time"}

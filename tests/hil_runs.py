@@ -2,9 +2,12 @@
 command records them.
 """
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
-from hil.control.recording.record import RunRecorder
+from hil.control.recording.record import TICKS, RunRecorder, lines
 from hil.control.tick.runner import Runner, TickRecord
 from tests.hil_flight import HOVER, Spy, fly, params, simple_policy
 from visthrow.onboard.policy import Policy, find_policy
@@ -18,6 +21,15 @@ def saved_policy(folder: Path, action=AT_ONCE) -> str:
     path = folder / "always.npz"
     simple_policy(action, "vision").save(path)
     return f'policy="{path}"'
+
+
+def copy_run(run: Path, folder: Path, change: Callable[[list[dict]], None]) -> Path:
+    """Copy a run's folder and change its ticks."""
+    shutil.copytree(run, folder, dirs_exist_ok=True)
+    ticks = list(lines(run / TICKS))
+    change(ticks)
+    (folder / TICKS).write_text("".join(json.dumps(tick) + "\n" for tick in ticks))
+    return folder
 
 
 def record_run(

@@ -1,7 +1,8 @@
-"""Two vehicles on one load against MuJoCo's bodies, with a release at two times."""
+"""Two or three vehicles on one load against MuJoCo's bodies, with a release at two times."""
 
 import numpy as np
 from numpy.testing import assert_allclose
+from pytest import mark
 
 from tests.physics.test_team import around, commands, hung, plant
 from visthrow.cooperative.referee import MujocoTeam
@@ -10,12 +11,13 @@ LOAD = 5e-4
 """Of the load after half a second [m]: 2 ms here, 0.5 ms and RK4 there; 0.2 mm was measured."""
 
 
-def test_the_load_and_both_vehicles_fly_as_on_mujoco():
-    sims = [hung(plant(), around(2), **options) for options in ({}, {"build": MujocoTeam})]
-    for k, command in enumerate(commands(25, 2)):
+@mark.parametrize("team", [2, 3])
+def test_the_load_and_its_vehicles_fly_as_on_mujoco(team):
+    sims = [hung(plant(), around(team), **options) for options in ({}, {"build": MujocoTeam})]
+    for k, command in enumerate(commands(25, team)):
         command[1, 2] *= 0.7
         for sim in sims:
-            sim.set_command(command, [k == 16, k == 17])
+            sim.set_command(command, k == 16 + np.minimum(np.arange(team), 1))
             sim.step()
     tree, referee = sims
     assert not tree.get("attached").any()

@@ -1,13 +1,13 @@
-"""Several vehicles on one load: conservation laws, a single vehicle's chain, releases."""
+"""Several vehicles on one load: a single vehicle's chain, releases."""
 
 from dataclasses import replace
 
 import numpy as np
 from numpy.testing import assert_allclose
-from pytest import approx, mark
+from pytest import approx
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, PlantParams
+from sim.params import PlantParams
 from tests.plants import paper_plant
 from visthrow.common.free_fall import fall_time, free_flight
 from visthrow.cooperative.team_sim import TeamSim
@@ -71,41 +71,6 @@ def test_one_vehicle_is_the_fused_chain():
     assert moved > 0.2
     assert_allclose(team.load[0].numpy(), single.get("payload_pos_w"), atol=SECOND_ORDER)
     assert_allclose(team.get("pos_w"), single.get("pos_w"), atol=SECOND_ORDER)
-
-
-@mark.parametrize("team", [2, 3])
-def test_momentum_changes_by_gravity_alone(team):
-    sim = hung(plant(), around(team), direct=True)
-    rng = np.random.default_rng(team)
-    sim.place(
-        sim.get("pos_w"),
-        vel_w=sim.get("vel_w"),
-        rate_b=rng.normal(size=(team, 3)),
-        cable_dir_w=sim.get("cable_dir_w"),
-    )
-    sim.step()
-    sim.step()  # the queue holds hover so long
-    before = momentum(sim)
-    for _ in range(10):
-        sim.step()
-    assert np.abs(sim.get("cable_vel_w")).max() > 0.1
-    mass = team * sim.params.total_mass
-    expected = before + [0.0, 0.0, -0.2 * GRAVITY * mass]
-    assert_allclose(momentum(sim), expected, atol=2e-4)  # of 1.2 N s
-
-
-def momentum(sim: TeamSim) -> np.ndarray:
-    """Linear momentum of everything [N s]."""
-    rope, rows = sim.params.rope, sim.worlds * sim.team
-    ends = np.repeat(sim.load[1].numpy(), sim.team, axis=0).astype(float)
-    total = sim.params.vehicle.body.mass * sim.get("vel_w").sum(0)
-    total = total + rope.payload_mass * ends.sum(0)
-    for i in reversed(range(rope.segments)):
-        swing = rope.segment_length * sim.get("cable_vel_w")[:, i]
-        total += rope.segment_mass * (ends - 0.5 * swing).sum(0)
-        ends = ends - swing
-    assert len(ends) == rows
-    return total
 
 
 def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():

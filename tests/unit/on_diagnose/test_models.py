@@ -19,7 +19,7 @@ from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
 from sim.params import LawParams
 from tests.commands import run_command
-from tests.flightlogs import log_at, with_channels
+from tests.flightlogs import level_log, log_at, with_channels
 from tests.places import DATA
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import explain_without_laws
@@ -175,11 +175,6 @@ class TestStand:
         record = json.loads((out / "fit.json").read_text())
         assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
         assert len(record["logs"]) == 3
-
-
-def level_log(time: np.ndarray, pos_w: np.ndarray) -> FlightLog:
-    """Return a log of a vehicle that stays level."""
-    return log_at(time, pos_w=pos_w, quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)))
 
 
 class TestFlyer:
@@ -348,7 +343,7 @@ class TestFlyer:
         """Closed form: half the acceleration that an effect makes times the time squared."""
         time = np.arange(0.0, 3.0, 0.01)
         log = level_log(time, np.tile([0.0, 0.0, 2.0], (len(time), 1)))
-        weight = Channel(time, np.full(len(time), FLYER.mass * G), "N")
+        weight = Channel(time, np.full((len(time), 1), FLYER.mass * G), "N")
         model = FlyerModel([with_channels(log, thrust_command=weight)], DRIVEN_BY_THRUST)
         seen = []
         for theta in ({}, {name: size}):

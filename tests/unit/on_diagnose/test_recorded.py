@@ -5,7 +5,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import approx, raises
 
-from tests.flightlogs import log_at, with_channels
+from tests.flightlogs import level_log, log_at, with_channels
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -53,8 +53,7 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
 
 def test_a_log_without_commands_is_told_what_makes_them():
     """As PX4's, which holds motor outputs, poses and rates."""
-    quat = np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
-    log = log_at(np.arange(20.0), pos_w=np.zeros((20, 3)), quat_wb=quat)
+    log = level_log(np.arange(20.0), np.zeros((20, 3)))
     with raises(DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"):
         record_of(log)
 

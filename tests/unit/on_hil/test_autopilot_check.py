@@ -1,6 +1,5 @@
-"""What a recorded run says of its hover, and what its summary keeps of the autopilot."""
+"""What a recorded run says of its hover."""
 
-import json
 import shutil
 from types import SimpleNamespace
 
@@ -10,11 +9,11 @@ from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
 from hil.control.recording.record import TICKS, RunRecorder
 from hil.errors import RunError
-from hil.fly_run import autopilot_record
 from hil.poses.pose import VEHICLE
 from tests.commands import run_command
 from tests.configs import load_run
 from tests.hil_flight import NEVER, Nobody
+from tests.hil_runs import copy_run
 from tests.level import LevelPlant
 from tests.loopback.wire import peers
 
@@ -23,13 +22,11 @@ QUICK = ("states.check_hold=0.2",)
 
 @fixture(scope="module")
 def run(tmp_path_factory):
-    """The folder of a run that hovers for some seconds, and what its summary keeps."""
+    """The folder of a run that hovers for some seconds."""
     folder = tmp_path_factory.mktemp("hover") / "run"
     runner, source, clock, _ = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)
     recorder = RunRecorder(folder, runner.params)
-    summary = Loop(runner, source, clock, Nobody(), recorder).fly(4.0)
-    summary["autopilot"] = autopilot_record(runner.backend, source._link)
-    recorder.close(summary)
+    recorder.close(Loop(runner, source, clock, Nobody(), recorder).fly(4.0))
     return folder
 
 
@@ -44,13 +41,12 @@ def test_the_hover_of_a_run_is_its_weight(run):
 def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     run, tmp_path, factor, good
 ):
-    lines = [json.loads(line) for line in (run / TICKS).read_text().splitlines()]
-    for line in lines:
-        if line["command"]:
-            line["command"][0] *= factor
-    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
-    (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
-    found, text = hover_of_run(tmp_path)
+    def strengthen(ticks):
+        for tick in ticks:
+            if tick["command"]:
+                tick["command"][0] *= factor
+
+    found, text = hover_of_run(copy_run(run, tmp_path, strengthen))
     assert found == good
     assert run_command(f"hil check --hover-of {tmp_path}") == (0 if good else 1)
     ratio = float(text.split()[2])
@@ -61,15 +57,15 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
 
 def test_a_hover_counts_once_it_has_settled(run, tmp_path):
     """Neither the first second nor the one after a break is the hover's thrust."""
-    lines = [json.loads(line) for line in (run / TICKS).read_text().splitlines()]
-    flown = [i for i, line in enumerate(lines) if line["state"] == "ready" and line["command"]]
-    middle = flown[len(flown) // 2]
-    lines[middle]["state"] = "throw"
-    for i in (*flown[:SETTLING], *range(middle + 1, middle + 1 + SETTLING)):
-        lines[i]["command"][0] *= 3.0
-    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
-    (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
-    assert hover_of_run(tmp_path)[1].startswith("hover took 1.0")
+
+    def disturb(ticks):
+        flown = [i for i, tick in enumerate(ticks) if tick["state"] == "ready" and tick["command"]]
+        middle = flown[len(flown) // 2]
+        ticks[middle]["state"] = "throw"
+        for i in (*flown[:SETTLING], *range(middle + 1, middle + 1 + SETTLING)):
+            ticks[i]["command"][0] *= 3.0
+
+    assert hover_of_run(copy_run(run, tmp_path, disturb))[1].startswith("hover took 1.0")
 
 
 @mark.parametrize(

@@ -24,7 +24,7 @@ from hil.control.recording.record import load_run
 from hil.control.recording.run_report import finish
 from tests.commands import run_python
 from tests.hil_flight import TICK
-from tests.hil_runs import record_run, saved_policy
+from tests.hil_runs import copy_run, record_run, saved_policy
 
 LAG = 0.11
 CLOCK = 3e-3
@@ -93,18 +93,19 @@ def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
     """As Betaflight has it while it is not armed: frames go out, motors stand still, and have to
     spin up.
     """
-    folder = shutil.copytree(run[0], tmp_path / "late")
-    lines = [json.loads(text) for text in (folder / "ticks.jsonl").read_text().splitlines()]
+    lines = load_run(run[0])[2]
     first = next(n for n, line in enumerate(lines) if line["command"] is not None)
     lag = read(run[0]).playback.runner.pilot.policy.contract["vehicle"]["motor"]["time_constant"]
     late = [
         line["time"]
         for line in lines[first : first + 3 + math.ceil(flightlogs.SPUN_UP * lag / TICK)]
     ]
-    for line in lines[: first + 3]:
-        line["status"][3] = "wait"
-    (folder / "ticks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    command = flightlogs.whole(read(folder))["command"]
+
+    def disarm(ticks):
+        for tick in ticks[: first + 3]:
+            tick["status"][3] = "wait"
+
+    command = flightlogs.whole(read(copy_run(run[0], tmp_path / "late", disarm)))["command"]
     assert command.time[~command.valid].tolist() == late
     assert len(command.time) > 10
 

@@ -15,7 +15,7 @@ from hil.control.recording.view import follow
 from hil.errors import RunError
 from tests.commands import run_command
 from tests.hil_flight import params
-from tests.hil_runs import record_run
+from tests.hil_runs import copy_run, record_run
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
 from visthrow.common.toml_text import dumps
@@ -37,12 +37,12 @@ def run_folder(tmp_path_factory):
 
 
 def test_one_bit_that_differs_is_found(run_folder, tmp_path, printed):
-    shutil.copytree(run_folder, tmp_path, dirs_exist_ok=True)
-    rows = list(lines(tmp_path / "ticks.jsonl"))
-    changed = next(row for row in rows if row["action"] is not None)
-    changed["action"][1] = float(np.nextafter(np.float32(changed["action"][1]), np.float32(1.0)))
-    (tmp_path / "ticks.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    assert f"tick {changed['n']}: action was" in printed(f"hil replay {tmp_path}", status=1)
+    def turn_a_bit(ticks):
+        action = ticks[100]["action"]
+        action[1] = float(np.nextafter(np.float32(action[1]), np.float32(1.0)))
+
+    copy_run(run_folder, tmp_path, turn_a_bit)
+    assert "tick 100: action was" in printed(f"hil replay {tmp_path}", status=1)
 
 
 def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys, printed):

@@ -8,6 +8,7 @@ from hil.errors import LinkError
 from hil.links.pymav import mav
 from hil.links.roster import MOST_KEPT, SILENT, SIMULATED, Party, Roster, check_allowed
 from tests.loopback.wire import wired
+from tests.unit.on_hil.test_sources import mocap, odometry
 
 AUTOPILOT = Party("autopilot", 1, 1, autopilot=mav.MAV_AUTOPILOT_PX4)
 VEHICLE = Party("vehicle", 1, 1, frozenset({"ATT_POS_MOCAP"}))
@@ -20,16 +21,7 @@ def beat(autopilot=mav.MAV_AUTOPILOT_PX4, **ids):
 
 
 def pose(**ids):
-    return wired(mav.MAVLink_att_pos_mocap_message(5, [1.0, 0.0, 0.0, 0.0], 1.0, 2.0, 3.0), **ids)
-
-
-def odometry(**ids):
-    return wired(
-        mav.MAVLink_odometry_message(
-            7, 20, 12, 1.0, 2.0, 3.0, [1.0, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0.0] * 21, [0.0] * 21
-        ),
-        **ids,
-    )
+    return wired(mocap(), **ids)
 
 
 def roster(*parties, **more):
@@ -42,7 +34,7 @@ def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
     who, said = roster()
     assert who.admit(pose(), A, 0.0)
     assert who.admit(beat(), B, 0.1)
-    assert who.admit(odometry(system=42, component=7), A, 0.2)
+    assert who.admit(wired(odometry(), system=42, component=7), A, 0.2)
     assert who.at == {"vehicle": A, "autopilot": B, "payload": A}
     assert (who.refused, said) == (0, [])
     assert who.addresses(mav.MAVLink_command_long_message(1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)) == (B,)

@@ -35,7 +35,7 @@ def test_a_lower_battery_gets_more_share():
 
 
 @mark.parametrize(
-    ("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)]
+    ("off", "good"), [(0.002, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)]
 )
 def test_the_measured_hover_is_held_against_the_calibration(off, good):
     meter = HoverMeter(BENT)

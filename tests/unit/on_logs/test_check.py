@@ -13,7 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from bench import delays
 from tests.commands import run_command
-from tests.flightlogs import DELAY, UNITS, G, flight, log_at, log_of, upright, with_channels
+from tests.flightlogs import (
+    DELAY,
+    UNITS,
+    G,
+    flight,
+    level_log,
+    log_at,
+    log_of,
+    upright,
+    with_channels,
+)
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
@@ -636,8 +646,7 @@ def test_thrust_that_answers_gusts_is_on_no_other_clock(stiffness, damping, last
         speed += 0.01 * (lift - 9.81 + gust)
         height += 0.01 * speed
         place[i, 2] = height
-    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
-    log = log_at(time, pos_w=place, quat_wb=level, thrust_command=thrust)
+    log = level_log(time, place, thrust_command=thrust)
     (row,) = thrust_checks.look(log)
     assert (row.topic, row.verdict) == ("delay", "ok")
     early = with_channels(log, thrust_command=Channel(time - 0.4, thrust, "N"))

@@ -45,9 +45,9 @@ def lines(rows, mark=",", comma=False):
     return out.getvalue().replace(".", ",") if comma else out.getvalue()
 
 
-def motive(version="1.23", pos=POS, turn=TURN, scale=1.0, units="Meters", gap=slice(0, 0)):
-    places = pos @ Y_UP.as_matrix().T * scale
-    quats = (Y_UP * turn * Y_UP.inv()).as_quat()
+def motive(version="1.23", scale=1.0, units="Meters", gap=slice(0, 0)):
+    places = POS @ Y_UP.as_matrix().T * scale
+    quats = (Y_UP * TURN * Y_UP.inv()).as_quat()
     head = ["Format Version", version, "Take Name", "t", "Capture Frame Rate", "100.000000"]
     head += ["Export Frame Rate", "100.000000", "Rotation Type", "Quaternion"]
     head += ["Length Units", units, "Coordinate Space", "Global"]

@@ -1,4 +1,4 @@
-"""The baseline's pendulum: conservation, closed forms, constraints, Jacobians."""
+"""The baseline's pendulum: Newton's law of each body, closed forms, constraints, Jacobians."""
 
 import numpy as np
 from numpy.linalg import norm
@@ -13,12 +13,6 @@ from visthrow.paper.baseline.mpc import MPCParams
 from visthrow.paper.baseline.pendulum_model import DIR, QUAT, RATE, VEL, Pendulum
 
 MODEL = Pendulum(0.21, 0.06, 0.36)
-
-
-RK4 = 1e-6
-"""Relative error of the classical method at 2 ms over a second of the swings below (measured 1e-8
-and less).
-"""
 
 
 def random_states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -37,32 +31,6 @@ def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     direction, rate = state[..., DIR], state[..., RATE]
     pos = state[..., pm.POS] - model.length * direction
     return pos, state[..., VEL] - model.length * np.cross(rate, direction)
-
-
-def energy(model: Pendulum, state: np.ndarray) -> np.ndarray:
-    """Kinetic and potential energy of both bodies [J], shape (...)."""
-    pos, vel = vehicle(model, state)
-    kinetic = model.vehicle_mass * (vel**2).sum(-1) + model.payload_mass * (
-        state[..., VEL] ** 2
-    ).sum(-1)
-    return 0.5 * kinetic + GRAVITY * (
-        model.vehicle_mass * pos[..., 2] + model.payload_mass * state[..., 2]
-    )
-
-
-def test_without_thrust_energy_and_momentum_are_kept():
-    state, control = random_states(20)
-    control[:, 0] = 0.0
-    later = state
-    for _ in range(500):
-        later = pm.step(MODEL, later, control, 0.002)
-    assert np.allclose(energy(MODEL, later), energy(MODEL, state), rtol=RK4)
-    both = []
-    for now in (state, later):
-        _, vel = vehicle(MODEL, now)
-        both.append(0.21 * vel + 0.06 * now[:, VEL])
-    fallen = both[0] - [0.0, 0.0, 0.27 * 9.81 * 1.0]
-    assert np.allclose(both[1], fallen, atol=1e-6)
 
 
 def test_newton_holds_for_each_body_with_the_tension_between_them():

@@ -33,6 +33,13 @@ def true_frame(env: ThrowEnv) -> torch.Tensor:
     return torch.cat([vehicle, offset], dim=-1)
 
 
+def require_spread(errors: torch.Tensor, step: float, bias: float) -> None:
+    """Fail where errors at some steps, shape (T, ...), have another noise or bias."""
+    assert errors.std().item() == approx(math.hypot(step, bias), rel=SPREAD)
+    within = errors.std(dim=0).square().mean().sqrt()
+    assert within.item() == approx(step, rel=SPREAD), "the bias must hold over the steps"
+
+
 def test_measurements_have_the_configured_noise_and_bias():
     step, bias = 0.01, 0.03
     env = env_of(
@@ -45,9 +52,7 @@ def test_measurements_have_the_configured_noise_and_bias():
         errors.append(env.measured[0] - true_frame(env))
         env.carry(env.previous_action)
     errors = torch.stack(errors)  # (T, E, 20)
-    assert errors.std().item() == approx(math.hypot(step, bias), rel=SPREAD)
-    within = errors.std(dim=0, unbiased=True).square().mean().sqrt()
-    assert within.item() == approx(step, rel=SPREAD), "the bias must hold over the steps"
+    require_spread(errors, step, bias)
     assert errors.mean().abs() < 4.0 * bias / math.sqrt(COUNT * 20)
 
 
@@ -77,10 +82,7 @@ def test_flown_commands_have_the_configured_noise_and_bias():
     for _ in range(4):
         env.carry(action)
         errors.append((env.views.command.clone() - wanted) / scale)
-    errors = torch.stack(errors)
-    assert errors.std().item() == approx(math.hypot(step, bias), rel=SPREAD)
-    within = errors.std(dim=0).square().mean().sqrt()
-    assert within.item() == approx(step, rel=SPREAD), "the bias must hold over the steps"
+    require_spread(torch.stack(errors), step, bias)
 
 
 def test_the_exact_critic_is_without_noise_and_the_actor_is_not():
