@@ -356,7 +356,6 @@ AUDITED = [
         {"GUID_OPTIONS": 5.0},
         ["GUID_OPTIONS is 5; expected with the bits of 8 set"],
     ),
-    ("ardupilot", "", {"ATC_ANGLE_BOOST": float("nan")}, ["ATC_ANGLE_BOOST is nan; expected 0"]),
     # older firmware answers no DO_GRIPPER without it
     ("px4", "", {"PD_GRIPPER_EN": 0.0}, ["PD_GRIPPER_EN is 0; expected 1, or none since 1.17"]),
     # the closed end taken for the open one

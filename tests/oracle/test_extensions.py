@@ -144,12 +144,22 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     assert_allclose(shot[0], shot[1], atol=5e-3)
 
 
-def test_flight_under_drag_and_wind():
-    drag, side, lift, wind = 5e-3, 2e-3, -1e-3, np.array([3.0, -1.0, 0.0])
+def test_mount_damping_is_the_joint_damping_of_a_rigid_rope():
+    plant = changed(fine(paper_plant()), {"rope.segments": 1})
+    mount = changed(plant, {"rope.joint_damping": 1e-4, "rope.mount_damping": 4e-4})
+    joint = changed(plant, {"rope.joint_damping": 5e-4})
+    assert np.abs(swing(mount) - swing(joint)).max() < 1e-12
+
+
+@mark.parametrize(
+    ("drag", "side", "lift", "wind", "extensions"),
+    [(0.0, 0.0, 0.0, (0.0, 0.0, 0.0), frozenset()), (5e-3, 2e-3, -1e-3, (3, -1, 0), EVERYTHING)],
+)
+def test_a_payload_flies_and_lands_as_its_equation_says(drag, side, lift, wind, extensions):
     rope = {"rope.payload_drag": drag, "rope.payload_side": side, "rope.payload_lift": lift}
-    others = {"air.wind_w": tuple(wind), "release.lag": 0.0}
+    others = {"air.wind_w": wind, "release.lag": 0.0}
     plant = changed(fine(paper_plant()), rope | others)
-    sim = HybridSim(plant, 1, extensions=EVERYTHING)
+    sim = HybridSim(plant, 1, extensions=extensions)
     sim.place(pos_w=np.array([[0.0, 0.0, 2.0]]), vel_w=np.array([[2.0, 1.0, 3.0]]))
     sim.set_command([[2.0, 0.0, 0.0, 0.0]], [1])
     sim.step()

@@ -3,19 +3,15 @@ plain NumPy.
 """
 
 import numpy as np
-from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, PlantParams, changed
+from sim.params import PlantParams, changed
 from tests.plants import paper_plant
-from tests.simulators import random_commands
 
 CLOCK = 1e-6
 """Times are sums of float32 periods [s]."""
-ROUND_OFF = 2e-5
-"""Of positions of some metres in float32 [m]."""
 PERIOD = 0.02
 
 
@@ -69,37 +65,6 @@ def test_asking_again_or_no_more_changes_nothing():
         often.step()
         for name in ("payload_pos_w", "pos_w", "attached", "separated", "release_timer"):
             assert_array_equal(once.get(name), often.get(name))
-
-
-def test_landing_flight_and_clearance():
-    """The projectile's formulas, written again, over many throws."""
-    count, asked_at = 64, 10
-    params = plant(0.11)
-    sim = HybridSim(params, count)
-    rng = np.random.default_rng(1)
-    height = rng.uniform(0.8, 3.0, count)
-    sim.place(
-        np.column_stack((rng.normal(size=(count, 2)), height)), vel_w=rng.normal(size=(count, 3))
-    )
-    commands = random_commands(2, 20, count) * [0.5, 0.3, 0.3, 0.3]
-    for k, command in enumerate(commands):
-        sim.set_command(command, np.full(count, k == asked_at))
-        sim.step()
-    assert not np.any(sim.get("attached"))
-    pos, vel = sim.get("payload_pos_w").astype(float), sim.get("payload_vel_w").astype(float)
-    drop = pos[:, 2] - params.release.landing_height
-    assert drop.min() > 0.0
-    time = (vel[:, 2] + np.sqrt(vel[:, 2] ** 2 + 2.0 * GRAVITY * drop)) / GRAVITY
-    landing = pos + time[:, None] * vel
-    landing[:, 2] = params.release.landing_height
-    assert_allclose(sim.get("time_to_impact"), time, atol=ROUND_OFF)
-    assert_allclose(sim.get("landing_w"), landing, atol=5 * ROUND_OFF)
-    fractions = np.linspace(0.0, 1.0, params.release.clearance_samples)[:, None]
-    flight = pos + (fractions * time)[..., None] * vel
-    flight[..., 2] -= 0.5 * GRAVITY * (fractions * time) ** 2
-    least = norm(flight - sim.get("release_pos_w"), axis=-1).min(axis=0)
-    assert_allclose(sim.get("clearance"), least, atol=ROUND_OFF)
-    assert np.ptp(time) > 0.1, "the throws must differ"
 
 
 def test_outputs_stay_after_the_landing_step():

@@ -13,6 +13,7 @@ from sim.params import LawParams
 from tests.commands import run_command
 from tests.configs import load_experiment
 from tests.unit.on_diagnose.test_models import ball_log
+from tests.unit.on_sim.test_firmware import SETTINGS
 from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
@@ -329,17 +330,8 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):
     say is named.
     """
     log, out = tmp_path / "LOG00001.BFL", tmp_path / "firmware.toml"
-    header = {
+    header = SETTINGS | {
         "Firmware revision": "Betaflight 4.6.0",
-        "rollPID": "11,20,8",
-        "pitchPID": "12,21,9",
-        "yawPID": "45,80,0",
-        "ff_weight": "0,0,0",
-        "iterm_relax_cutoff": "15",
-        "motor_idle": "550",
-        "pidsum_limit": "1000",
-        "iterm_windup": "80",
-        "gyro_lpf2_static_hz": "500",
         "tpa_rate": "65",
         "Field I name": "loopIteration,time",
         "Field I signed": "0,0",

@@ -70,20 +70,6 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
             assert_allclose(part.score[at, effects], score[effects], rtol=1e-6, atol=1e-4)
 
 
-def test_windows_say_the_same_in_one_batch_and_alone(fitted):
-    _, _, _, levels, grams = fitted
-    extended = [marginal.with_latent_effects(gram) for gram in grams]
-    together = integrals(extended, levels).statistics(extended, np.zeros(len(EFFECTS)))
-    for w, gram in enumerate(extended):
-        by_itself = alone(gram, levels, w)
-        size = by_itself.score.shape[1]
-        for name in ("information", "score", "square"):
-            expected = getattr(by_itself, name)[0]
-            values = getattr(together, name)[w][(slice(size),) * expected.ndim]
-            scale = np.abs(expected).max()
-            assert_allclose(values, expected, rtol=0.0, atol=1e-9 * scale)
-
-
 def test_likelihood_is_that_of_the_dense_covariance(fitted):
     """At any noise levels and any weights of the samples, so that models compare whose outliers are
     not the same.

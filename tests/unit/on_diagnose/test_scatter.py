@@ -205,25 +205,8 @@ def drawn(sizes, **options) -> SyntheticModel:
     )
 
 
-def deviation_of(mean: float, deviation: float, seed: int) -> float:
-    """Return the deviation that is found of a release that is late by so much in all flights and by
-    so much more or less in each [s]; 0 where it does not vary.
-    """
-    found = flights(default_rng(seed), release_lag=deviation)
-    common = np.zeros(len(NAMES))
-    common[0] = mean / PRIORS.floor[0]
-    moved = found.score + found.information @ common
-    return chosen_of(replace(found, score=moved))[1].get("lag_jitter", 0.0)
-
-
 def delay_jitter(diagnosis):
     return next(s for s in diagnosis.scatter if s.name == "cmd_jitter")
-
-
-def test_a_deviation_is_about_the_mean():
-    found = np.array([deviation_of(0.080, 0.012, seed) for seed in range(12)])
-    assert np.mean(found > 0.0) > 0.9
-    assert abs(np.median(found) / 0.012 - 1.0) < 0.3
 
 
 def test_what_flights_have_of_their_own_is_integrated_out():

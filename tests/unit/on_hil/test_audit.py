@@ -70,8 +70,8 @@ def test_writing_keeps_other_bits_and_is_read_back():
 
 
 def test_what_cannot_be_written_stays_wrong():
-    found, _, written, _, _ = audit({**GOOD, "FIXED": 1.0}, write=True)
-    assert (found.problems, written) == (["FIXED is 1; expected 7"], [])
+    found, _, written, _, _ = audit({**GOOD, "FIXED": float("nan")}, write=True)
+    assert (found.problems, written) == (["FIXED is nan; expected 7"], [])
 
 
 def test_a_value_that_the_vehicle_does_not_take_is_written_once():
