@@ -63,6 +63,7 @@ class PoseStream:
     says: str
     samples: Callable[[np.random.Generator], Iterator[Sample]] = field(default=regular(100.0))
     quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
+    ball: tuple[float, ...] | None = None  # the payload's attitude, where it is another
     frame: int = mav.MAV_FRAME_LOCAL_NED
     quality: int = 0
     wrong: int = 0  # of so many poses one jumps
@@ -74,6 +75,8 @@ STREAMS = {
     "100 Hz": PoseStream(""),
     "300 Hz": PoseStream("", regular(300.0)),
     "two senders": PoseStream("", second=True),
+    "a ball of NaN": PoseStream("", ball=(math.nan,) * 4),
+    "a ball of zeros": PoseStream("", ball=(0.0,) * 4),
     "1 Hz": PoseStream("vehicle: 1.0 good poses a second; expected 36 or more", regular(1.0)),
     "8 Hz": PoseStream("8.0 good poses a second; expected 36 or more", regular(8.0)),
     "zero": PoseStream("stamps are 0 s: the sender does not stamp", restamped(lambda s: 0)),
@@ -92,7 +95,7 @@ STREAMS = {
     "half refused": PoseStream("50 % of the poses are refused (", wrong=2),
     "2 kHz": PoseStream("2000 poses a second; expected 582 at most", regular(2000.0)),
 }
-"""Four good streams, then bad ones."""
+"""Good streams, then bad ones."""
 
 
 class Sent(MavlinkSource):
@@ -134,8 +137,8 @@ def _datagrams(stream: PoseStream, rng: np.random.Generator) -> Iterator[tuple]:
         for component, height in ((1, -1.333), (25, -0.95)):
             noise = 5e-4 * rng.standard_normal(3)
             x, y, z = noise + [0.4 * (stream.wrong > 0 and n % stream.wrong == 1), 0.0, height]
-            body = (x, y, z, list(stream.quat))
-            rest = (*[0.0] * 3, *[math.nan] * 3, [0.0] * 21, [0.0] * 21, 0, 0, stream.quality)
+            body = (x, y, z, list(stream.ball if component == 25 and stream.ball else stream.quat))
+            rest = (*[math.nan] * 6, [0.0] * 21, [0.0] * 21, 0, 0, stream.quality)
             message = mav.MAVLink_odometry_message(
                 stamp, stream.frame, mav.MAV_FRAME_BODY_FRD, *body, *rest
             )

@@ -15,8 +15,7 @@ from sim.kernels.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from sim.params import BodyParams
 from tests.plants import paper_plant
 from tests.simulators import bare_quadrotor, random_commands
-from visthrow import config
-from visthrow.task import TaskParams
+from visthrow.task import load_experiment
 
 COUNT = 5
 STEPS = 12
@@ -25,7 +24,7 @@ RELEASED = 4
 
 
 def start_spreads():
-    return config.load(TaskParams, config.find("task", "state")).start
+    return load_experiment("state").task.start
 
 
 def everything(sim: HybridSim) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from hil.poses.sources import images
 from tests import boards
 from tests.places import ROOT
 from visthrow import config
-from visthrow.task import rewards
+from visthrow.task import load_experiment, rewards
 from visthrow.training import trainer
 
 BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
@@ -108,7 +108,7 @@ def test_a_reward_term_is_trained_with(tmp_path, monkeypatch):
 def test_a_detector_finds_what_its_network_says(monkeypatch):
     monkeypatch.setattr(images, "DETECTORS", dict(images.DETECTORS))
     program = runpy.run_path(str(ROOT / "examples" / "add_detector.py"))
-    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    camera = load_experiment("state").camera
     picture = np.zeros((camera.fisheye.height, camera.fisheye.width, 3), np.uint8)
     lens = Fisheye(camera.fisheye)
     seen = images.DETECTORS["mine"](lens, camera.payload_radius, camera.goal_side).detect(picture)

@@ -11,7 +11,7 @@ from scipy.special import ellipk
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
-from tests.plants import calm, paper_plant, plain_plant, plain_vehicle
+from tests.plants import paper_plant, plain_plant, plain_vehicle
 from tests.simulators import bare_quadrotor, numerics, rods
 
 PERIOD = 1e-4
@@ -94,31 +94,6 @@ def test_motor_step():
         advance(sim, 1)
         expected = last + (first - last) * np.exp(-0.02 * k / vehicle.motor.time_constant)
         assert_allclose(sim.get("motor_speed")[0], expected, rtol=1e-8)
-
-
-def test_battery_sags_to_where_source_and_load_meet():
-    """At a steady load the voltage is the upper root of ``u^2 - u_oc u + R P = 0``."""
-    vehicle = paper_plant().vehicle
-    vehicle = replace(vehicle, aero=calm(vehicle.aero))
-    endless = replace(vehicle.battery, capacity=1e9)
-    vehicle = replace(vehicle, battery=endless, queue=QueueParams(0.0))
-    sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
-    start = sim.get("voltage")[0]
-    sim.set_command([[10.0, 0.0, 0.0, 0.0]])
-    advance(sim, 100)
-    voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0]
-    cell, thrust = vehicle.battery, vehicle.thrust
-    lift = (
-        thrust.k_f
-        * speed**2
-        * (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
-    )
-    power = cell.idle_power + np.sum(thrust.torque_ratio * lift * speed) / cell.efficiency
-    source = cell.ocv[0]
-    assert voltage == approx(
-        (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0, abs=1e-6
-    )
-    assert voltage < start - 0.3, "ten newtons must sag more than hover"
 
 
 def test_battery_counts_its_charge():

@@ -12,13 +12,11 @@ from pytest import mark
 
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
-from camera.params import CameraParams
-from sim.params import RopeParams
 from tests.commands import run_command, set_words
-from visthrow import config
 from visthrow.cli.fly import _rendered_eyes
 from visthrow.detector_training.eyes import RenderedEyes
 from visthrow.detector_training.scenes.scene import Nuisances
+from visthrow.task import load_experiment
 from visthrow.throws.flight_loop import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
@@ -69,11 +67,10 @@ def hanging():
 
 @mark.parametrize("by", sorted(NEAR))
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
-    camera = config.load(CameraParams, config.find("camera", "fisheye"))
-    rope = config.load(RopeParams, config.find("rope", "paper"))
+    plain = load_experiment("state")
     eyes = RenderedEyes(
-        camera,
-        rope,
+        plain.camera,
+        plain.rope,
         1,
         3,
         method=by,
@@ -82,7 +79,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     )
     now, goal = hanging()
     points, valid = eyes.look(now, now, goal, np.array([True]))
-    pilot = KeypointCamera(camera, dtype=torch.float64)
+    pilot = KeypointCamera(plain.camera, dtype=torch.float64)
     quat = torch.tensor(now.quat_wb / norm(now.quat_wb))
     from visthrow.onboard.observations import rotation_from_quat
 

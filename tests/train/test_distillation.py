@@ -9,10 +9,9 @@ from torch.testing import assert_close
 
 from tests.commands import set_words
 from tests.configs import QUIET, load_experiment
-from visthrow import cli, config
+from visthrow import cli
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment
 from visthrow.training.env import ThrowEnv
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -127,7 +126,7 @@ def test_a_throw_that_ended_teaches_no_more():
 
 
 def test_the_exported_policy_remembers_as_the_network_does(whole):
-    trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1)
+    trainer = Trainer(load_experiment(whole / "config.toml"), "cpu", 1)
     trainer.load(whole / CHECKPOINT)
     policy, network = Policy.load(whole / "policy.npz"), trainer.algorithm.average.module
     obs = torch.randn(FLOWN, 5, policy.obs_dim)
@@ -143,7 +142,7 @@ def test_the_pilot_remembers_as_training_does(whole):
     """The same commands from poses on board as from the environment's observations, with a memory
     that starts anew.
     """
-    experiment = config.load(Experiment, whole / "config.toml", QUIET)
+    experiment = load_experiment(whole / "config.toml", QUIET)
     policy = Policy.load(whole / "policy.npz")
     env, pilot = ThrowEnv(experiment, "cpu", 3, 3), Pilot(policy, experiment.camera, 3)
     for _ in range(2):
@@ -165,7 +164,7 @@ def test_the_pilot_remembers_as_training_does(whole):
 
 def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, refused):
     policy, start = Policy.load(whole / "policy.npz"), ["--from", str(whole / "policy.npz")]
-    trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 2)
+    trainer = Trainer(load_experiment(whole / "config.toml"), "cpu", 2)
     trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
     for name, value in policy.estimator.parts().items():

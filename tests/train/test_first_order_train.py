@@ -6,9 +6,9 @@ from pytest import mark
 
 from tests.commands import set_words
 from tests.configs import load_experiment
-from visthrow import cli, config
+from visthrow import cli
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment, contract_of
+from visthrow.task import contract_of
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = [
@@ -30,7 +30,7 @@ def words(folder, *extra):
 def test_its_policy_is_one_like_any_other(tmp_path):
     whole = tmp_path / "run"
     assert cli.main(words(whole)) == 0
-    experiment = config.load(Experiment, whole / "config.toml")
+    experiment = load_experiment(whole / "config.toml")
     policy = Policy.load(whole / "policy.npz")
     policy.require(contract_of(experiment))
     trainer = Trainer(experiment, "cpu", 1)

@@ -16,13 +16,13 @@ from torch.testing import assert_close
 
 from tests.commands import run_command, set_words
 from tests.configs import load_experiment
-from visthrow import cli, config
+from visthrow import cli
 from visthrow.common import storage
 from visthrow.common.toml_text import tables_beside
 from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.paper import measurements
-from visthrow.task import Experiment, contract_of
+from visthrow.task import contract_of
 from visthrow.training import session, trainer
 from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.trainer import CHECKPOINT, Trainer
@@ -84,7 +84,7 @@ def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):
     } <= names
     rows = (whole / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + 4
-    experiment = config.load(Experiment, whole / "config.toml")
+    experiment = load_experiment(whole / "config.toml")
     Policy.load(whole / "policy.npz").require(contract_of(experiment))
 
 
@@ -102,7 +102,7 @@ def test_networks_may_round_their_products_and_observations_may_not(whole, monke
 
     watch(observations, "observe")
     watch(PPOTraining, "learn")
-    Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1).step()
+    Trainer(load_experiment(whole / "config.toml"), "cpu", 1).step()
     assert rounded == {"observe": {False}, "learn": {True}}
     assert not torch.backends.cuda.matmul.allow_tf32
 
@@ -283,7 +283,7 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, printed)
 
 def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
     words = [*SMALL, "ppo.segments=5", "ppo.substep=0.004"]
-    experiment = config.load(Experiment, config.find("train", "laptop"), words)
+    experiment = load_experiment("laptop", words)
     run = Trainer(experiment, "cpu", 1)
     coarse = run.algorithm.env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
@@ -292,7 +292,7 @@ def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
 
 
 def test_the_policy_of_ppo_has_the_mean_of_the_last_iterations_weights():
-    experiment = config.load(Experiment, config.find("train", "laptop"), SMALL)
+    experiment = load_experiment("laptop", SMALL)
     run = Trainer(experiment, "cpu", 1)
     mean = torch.zeros(())
     for iteration in range(3):

@@ -12,8 +12,7 @@ from camera.detectors.following import LOST, MEMORY, READ, BallGoalTracker
 from camera.detectors.learnt import LearntDetector
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
-from camera.params import CameraParams
-from visthrow import config
+from visthrow.task import load_experiment
 
 RADIUS, SIDE, LENGTH, PERIOD = 0.033, 0.3, 0.36, 0.02
 EYE = np.array([0.0, 0.0, 1.3])
@@ -204,7 +203,7 @@ def bayes(detector, probability, off, within):
 
 @fixture(scope="module")
 def learnt():
-    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    camera = load_experiment("state").camera
     return LearntDetector(Fisheye(camera.fisheye), RADIUS, camera.goal_side)
 
 

@@ -69,7 +69,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     given = diagnosis(scatter=scatter, findings=[own, own | {"name": "wind_y"}])
     assert run_command(f"diagnose apply {given} --out {out} --plants 8") == 0
     capsys.readouterr()
-    after, before = config.load(Experiment, out), shipped()
+    after, before = load_experiment(out), shipped()
     assert_allclose(after.vehicle.thrust.gain, 1.03)
     assert after.vehicle.body.mass == approx(before.vehicle.body.mass + 0.006)
     assert after.rope.length == approx(before.rope.length - 0.004)
@@ -107,7 +107,7 @@ def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_
     said = printed(f"diagnose apply {found} --out {out}")
     assert "Not written: battery_charge" in said
     assert "Not written: battery_charge" in out.read_text()
-    after = config.load(Experiment, out)
+    after = load_experiment(out)
     assert after.vehicle.battery == shipped().vehicle.battery
     assert after.diagnosed.effects == ("thrust_gain",)
     assert after.diagnosed.covariance == ((4e-4,),)
@@ -138,7 +138,7 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refu
         refused(f"diagnose apply {report} {option} --out {out}", said=message)
     assert not out.exists()
     assert run_command(f"diagnose apply {diagnosis(plant=str(quick), **found)} --out {out}") == 0
-    after = config.load(Experiment, out)
+    after = load_experiment(out)
     assert (after.release.lag, after.rope.length) == approx((0.11, 0.5))
 
 
@@ -156,7 +156,7 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
     out = tmp_path / "law.toml"
     command = f"diagnose apply {diagnosis(theta={}, covariance=[], laws=[law])} --out {out}"
     assert "vertical_cross_vel" in printed(f"{command} --laws 1")
-    assert config.load(Experiment, out).laws == (
+    assert load_experiment(out).laws == (
         LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
     )
     refused(f"{command} --laws 2", said="asks for number 2 of its laws; expected a number up to 1")
@@ -348,7 +348,7 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):
     command = f"diagnose apply {log} --plant vision --out {out}"
     refused(command, said="--hover")
     assert run_command(f"{command} --hover 0.3645 --delay 0.003") == 0
-    after = config.load(Experiment, out)
+    after = load_experiment(out)
     assert after.vehicle.controller.kind == "motor_mixing"
     assert after.vehicle.controller.p_gain[0] == approx(0.01748, rel=1e-3)
     assert after.vehicle.queue.delay == 0.003

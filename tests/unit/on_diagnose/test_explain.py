@@ -9,10 +9,10 @@ from bench.diagnose.altered import with_values
 from bench.diagnose.cases import logs_of
 from bench.worlds.world import Recipe
 from tests.commands import run_command
-from visthrow import cli, config
+from visthrow import cli
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog
-from visthrow.task import Experiment, drawn_plants
+from visthrow.task import drawn_plants, load_experiment
 
 MODEL = ("--only", "com_x", "--set", "rope.segments=1", "--device", "cpu", "--no-report")
 
@@ -64,11 +64,11 @@ def test_what_was_explained_is_what_training_draws(once, tmp_path):
     """From flights to the draws of a training, through the files that users pass on."""
     out = tmp_path / "mine.toml"
     assert run_command(f"diagnose apply {once[0]}/diagnosis.json --out {out}") == 0
-    diagnosed = config.load(Experiment, out).diagnosed
+    diagnosed = load_experiment(out).diagnosed
     assert diagnosed.effects == ("com_x",)
     (sd,) = np.sqrt(diagnosed.covariance[0])
     assert 2e-5 < sd < 4e-4, "of 3 mm that three throws show to a few hundredths"
-    centres = [plant.vehicle.body.com[0] for plant in drawn_plants(config.load(Experiment, out), 0)]
+    centres = [plant.vehicle.body.com[0] for plant in drawn_plants(load_experiment(out), 0)]
     assert np.mean(centres) == approx(3e-3, abs=3.0 * sd)
     assert np.std(centres) == approx(sd, rel=0.5)
 

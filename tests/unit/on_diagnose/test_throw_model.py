@@ -18,7 +18,6 @@ from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import explain_without_laws
-from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -33,6 +32,7 @@ from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.task import load_experiment
 
 LATENT = np.array(
     [5e-4, 5e-6, 5e-5]
@@ -185,7 +185,7 @@ def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
 def test_the_catalogue_is_sound():
     plant = replace(
         generalised(setting_with({})),
-        camera=config.load(CameraParams, config.find("camera", "fisheye")),
+        camera=load_experiment("state").camera,
     )
     for name, e in catalogue().items():
         assert e.bounds[0] <= 0.0 <= e.bounds[1], name
@@ -263,7 +263,7 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
 
 
 def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
-    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    camera = load_experiment("state").camera
     logs = [looked_at(log, camera) for log in planted[0]]
     names = [*HIDDEN, "marker_rot_x"]
     model = ThrowModel(logs, setting_with(PLANTED).plant, camera=camera, only=names)
@@ -290,7 +290,7 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
 
 
 def test_a_manoeuvre_is_planned_beside_a_camera(planted):
-    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    camera = load_experiment("state").camera
     model = ThrowModel(planted[0][:1], paper_plant(), camera=camera, only=["com_x", "camera_focal"])
     after = SimpleNamespace(
         sigma=lambda channel: 1e-3, noise=SimpleNamespace(scale=np.ones(len(model.channels)))

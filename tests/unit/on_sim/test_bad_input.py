@@ -10,8 +10,7 @@ from sim.kernels.structs import EXTENSIONS, types
 from sim.params import AirParams, PlantParams, ReleaseParams, RopeParams, changed
 from tests.plants import paper_plant
 from tests.simulators import bare_quadrotor
-from visthrow import config
-from visthrow.task import TaskParams
+from visthrow.task import load_experiment
 
 
 def plant_with(path: str, value) -> PlantParams:
@@ -90,7 +89,7 @@ def test_what_does_not_fit_is_refused(name):
 
 
 def test_no_tethers():
-    z = config.load(TaskParams, config.find("task", "state")).start
+    z = load_experiment("state").task.start
     with raises(ValueError, match="tether_variants 0"):
         tether_lengths(paper_plant().rope, replace(z, tether_variants=0))
 

@@ -13,8 +13,7 @@ from scipy.stats import kstest
 
 from sim.hybrid import HybridSim, tether_lengths
 from tests.plants import paper_plant
-from visthrow import config
-from visthrow.task import TaskParams
+from visthrow.task import load_experiment
 
 COUNT = 6000
 SIGNIFICANCE = 1e-4
@@ -26,7 +25,7 @@ EDGE = 1e-5
 @lru_cache
 def spreads():
     """The paper's, as the tasks load them."""
-    return config.load(TaskParams, config.find("task", "state")).start
+    return load_experiment("state").task.start
 
 
 @lru_cache
