@@ -171,6 +171,16 @@ def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     assert diagnosis.overall == result.KNOWN
 
 
+def test_flights_that_differ_each_for_itself_leave_nothing_to_vary():
+    sizes = (20.0, 0.0, 26.0, 0.0, 0.0, 20.0)
+    model = altered(lambda m, w: pushed(m, w, sizes[w.flight]), throws=5)
+    diagnosis = diagnose_flights.explain(model, laws=False)
+    assert diagnosis.events == (0, 2, 5)
+    assert diagnosis.overall == result.KNOWN
+    assert "effect_03 in flight 0 and effect_03 in flight 2" in diagnosis.reasons[0]
+    assert not [s for s in diagnosis.scatter if s.found]
+
+
 def best_set(sizes) -> set[str]:
     """Return the names of the set that flights ask for, each with its own size of one effect."""
     priors = replace(_priors(1), slab=np.full(1, 20.0))

@@ -184,7 +184,9 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
-        verdicts.append(replace(verdict, found=not usual))
+        # flights that were found to differ each for itself may leave nothing to vary
+        found = not usual and verdict.size > verdict.floor
+        verdicts.append(replace(verdict, found=found))
         if not usual:
             shares[c] = max(verdict.size, verdict.floor) / effect.prior_sd
     return tuple(verdicts), shares
@@ -512,6 +514,9 @@ def _explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
     nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
+    unlike = sorted(c.name for c in selection.best.chosen if c.group == EVENT)
+    if len(unlike) > 1:  # a single flight's is an accident, beside which the model explains all
+        besides += unlike
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
     return result.NO_EFFECT, "", [nothing], set()
