@@ -65,7 +65,7 @@ ROUGHLY_NATS = 1.0  # the same while correlation times are compared
 # of the logarithm of a level in one step: its variance may be predicted to fall below 0
 LONGEST_FALL = 1.0
 HALVINGS = 8
-STALLED = 1e-9  # of the step: limits and levels count as met within this
+STALLED = 1e-3  # of a level: limits count as met within this share of it
 
 
 def fit(
@@ -235,6 +235,9 @@ def maximised(
             if tried > value:
                 break
             step = step / 3.0
+            promised = promised / 3.0
+            if promised < tolerance:
+                return layout.unpack(x, noise), value
         else:
             break
         x = x + step
