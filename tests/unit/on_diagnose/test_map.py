@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from tests.flightlogs import flight, log_at, log_of
 from tests.places import DATA
 from tests.plants import paper_plant
-from visthrow.common.errors import LogError
+from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
 from visthrow.diagnose.inputs.proposal import propose
@@ -423,3 +423,12 @@ def test_an_accelerometer_says_which_column_of_a_quaternion_is_w():
     assert found["acc_b"].axes == found["rate_b"].axes == "x,-y,-z"
     assert "pos_w" not in found
     assert found["rate_b"].unit == "rad/s"
+
+
+def test_an_attitude_that_comes_too_seldom_is_refused_by_its_period():
+    columns = flight(20.0)
+    whole = log_of(columns)
+    attitude = Channel(columns["time"][3::6] + 0.003, columns["quat_wb"][3::6], "1", "world")
+    log = FlightLog(whole.channels | {"quat_wb": attitude}, {"source": "a.ulg"})
+    with raises(DiagnoseError, match="the attitude comes every 60 ms"):
+        record_of(log)

@@ -212,8 +212,10 @@ def _paired(
         attitudes = Samples(quat.time, quat.values).attitudes(pos.time[rows])
     if len(rows) < 5:
         raise DiagnoseError(
-            f"flight {number}: positions and attitudes of the vehicle were never measured at one"
-            " time"
+            f"flight {number}: hardly any position lies between two attitudes less than"
+            f" {1e3 * BETWEEN:.0f} ms apart: the attitude comes every"
+            f" {1e3 * np.median(np.diff(quat.time)):.0f} ms, from {quat.time[0]:.1f} to"
+            f" {quat.time[-1]:.1f} s; positions from {pos.time[0]:.1f} to {pos.time[-1]:.1f} s"
         )
     time = pos.time[rows]
     vehicle = ChannelSamples(time, pos.values[rows], pos.sigma)
