@@ -20,7 +20,6 @@ from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effec
 from visthrow.diagnose.models.law_terms import Term, carries, term_of
 from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
-from visthrow.diagnose.models.settling import settle
 from visthrow.diagnose.models.thrust_map import command_of as command_of
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -31,6 +30,9 @@ EFFECT_STEP = 0.05
 of rounding do not matter.
 """
 NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in their prior deviations
+SETTLE_STEPS = 5
+# a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
+SETTLED = 1e-3
 MOST_LANES = 6000  # simulated in one batch
 
 
@@ -360,22 +362,51 @@ class NumericModel(Model, ABC):
 
     def _settle(self, size: ndarray) -> list[ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
+        residuals = self._off(size, self._start)
         if not self._start.shape[1]:
-            return self._off(size, self._start)
+            return residuals
         if not self._slopes:
             self._slopes = self._slopes_by_start(size)
-        middle = np.array([s.start for s in self.stretches])
-        sd = np.array([s.nuisance_sd for s in self.stretches])
-        sigmas = [s.sigma for s in self.stretches]
+        aims = self._aims(residuals, self._start)
+        for _ in range(SETTLE_STEPS):
+            steps = np.array([self._newton(i, aim) for i, aim in enumerate(aims)])
+            before = _costs(aims)
+            for shrink in (1.0, 0.3):
+                if not np.any(steps):
+                    break
+                trial = self._start + shrink * steps
+                trial_residuals = self._off(size, trial)
+                trial_aims = self._aims(trial_residuals, trial)
+                better = _costs(trial_aims) < _costs(aims)
+                for i in np.flatnonzero(better):
+                    residuals[i] = trial_residuals[i]
+                    aims[i] = trial_aims[i]
+                self._start = np.where(better[:, None], trial, self._start)
+                steps[better] = 0.0
+            if np.max(before - _costs(aims)) < 2 * SETTLED:
+                break
+        return residuals
 
-        def fly(unknowns: ndarray) -> list[ndarray]:
-            residuals = self._off(size, middle + sd * unknowns)
-            return [residual / sigma for residual, sigma in zip(residuals, sigmas)]
+    def _aims(self, residuals: list[ndarray], start: ndarray) -> list[ndarray]:
+        """Return residuals, and behind them the way back to the prior's middle, in their
+        deviations.
+        """
+        aims = []
+        for s, residual, state in zip(self.stretches, residuals, start):
+            back = (s.start - state) / s.nuisance_sd
+            aims.append(np.concatenate([residual / s.sigma, back]))
+        return aims
 
-        parts = zip(self._slopes, sd, sigmas)
-        rows = [slope * each / sigma[:, None] for slope, each, sigma in parts]
-        self._start = middle + sd * settle(fly, rows, (self._start - middle) / sd)
-        return self._off(size, self._start)
+    def _newton(self, i: int, aim: ndarray) -> ndarray:
+        """Return the Gauss-Newton step of a window's unknowns; 0 where it promises little."""
+        s = self.stretches[i]
+        none = np.zeros(len(s.start))
+        prior = np.diag(1.0 / s.nuisance_sd)
+        rows = np.concatenate([self._slopes[i] / s.sigma[:, None], prior])
+        if not (np.all(np.isfinite(aim)) and np.all(np.isfinite(rows))):
+            return none  # no step mends that; the search says which window it is
+        step = np.linalg.lstsq(rows, aim, rcond=None)[0]
+        return step if 0.5 * aim @ rows @ step > SETTLED else none
 
     def _slopes_by_start(self, size: ndarray) -> list[ndarray]:
         """Return the derivatives of the samples by what is not known at the start."""
@@ -409,6 +440,12 @@ class NumericModel(Model, ABC):
         for higher, lower, step in zip(above, below, steps):
             slopes.append((0.5 * (higher - lower)).T / step)
         return slopes
+
+
+def _costs(aims: list[ndarray]) -> ndarray:
+    """Return the sum of squares of each window; infinite where a simulation ran away."""
+    squares = np.array([aim @ aim for aim in aims])
+    return np.where(np.isnan(squares), np.inf, squares)
 
 
 def _holds(log: FlightLog, name: str) -> bool:

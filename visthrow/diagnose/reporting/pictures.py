@@ -12,7 +12,6 @@ from visthrow.diagnose.likelihood.forms import readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.models.settling import newton
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
@@ -64,7 +63,8 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
     """
     weight = 1.0 / (window.sigma * noise.scale[window.channel])
     states = window.nuisance * window.nuisance_sd * weight[:, None]
-    fitted = newton(states, window.residual * weight)
+    normal = states.T @ states + np.eye(states.shape[1])
+    fitted = np.linalg.solve(normal, states.T @ (window.residual * weight))
     return window.residual - window.nuisance * window.nuisance_sd @ fitted
 
 

@@ -78,8 +78,8 @@ class Direction:
 
     @property
     def follows(self) -> bool:
-        """Whether it is fitted, and goes with the effects: a bend of the rope does neither, which
-        would take the place of a wrong length.
+        """Whether it goes with the effects: a bend of the rope does not, which would take the place
+        of a wrong length.
         """
         return not self.field.startswith("cable") or self.part == "all"
 

@@ -99,7 +99,7 @@ class ThrowModel(Model):
         self.substep = substep
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        self.flights = self._taut(flights, self._cuts_of(flights, hangs))
+        states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
         self.channels = [*_measured(flights, any(hangs)), *(kind.channel for kind in self._direct)]
@@ -115,8 +115,9 @@ class ThrowModel(Model):
             note = OTHER_CHARGE if "battery_charge" in self.entries else ""
             self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + note)
         fitter = self._initial_fit(self.setting, self.flights)
+        begun = fitter.fit(states, {})
         # states at theta = 0, and the samples' derivatives by them
-        self._nominal = fitter.settled(), fitter.rows
+        self._nominal = begun, fitter.slopes
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
@@ -141,11 +142,18 @@ class ThrowModel(Model):
         x = self.setting.sensing
         return ReplayedFlights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
 
-    def _taut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
-        """Return the windows without the time in which ropes were slack."""
-        windows = self.cut_into(flights, cuts)
-        _, ends = carried(windows, self.simulation(self.setting))
-        return self.cut_into(flights, self._without_slack(windows, ends))
+    def _settled_without_slack(
+        self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
+    ) -> States:
+        """Take the windows without the time in which ropes were slack; returns initial states."""
+        self.flights = self.cut_into(flights, cuts)
+        simulation = self.simulation(self.setting)
+        states, ends = carried(self.flights, simulation)
+        without_slack = self._without_slack(ends)
+        if without_slack != cuts:
+            self.flights = self.cut_into(flights, without_slack)
+            states, _ = carried(self.flights, simulation)
+        return states
 
     def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
         """Take effects by their names: first those that are simulated by degrees, then switches,
@@ -311,7 +319,7 @@ class ThrowModel(Model):
         """
         setting = self.at(theta)
         flights = self.cut_into(self.flights.flights, cuts)
-        return setting, self._initial_fit(setting, flights).settled()
+        return setting, self._initial_fit(setting, flights).settled({})
 
     def simulation(self, *settings: Setting) -> Simulation:
         """Settings ready to be flown in, with this model's steps."""
@@ -323,13 +331,13 @@ class ThrowModel(Model):
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
-        states, rows = self._nominal
+        states, slopes = self._nominal
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting, self.flights)
         places = [way.place for way in directions(self.setting.plant)]
         alike = [way.place for way in fitter.directions] == places
-        return fitter.settled(rows if alike else ())
+        return fitter.settled(slopes if alike else {})
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
@@ -344,16 +352,16 @@ class ThrowModel(Model):
         numbers = [channels.index(name) if name in channels else -1 for name in REPLAYED]
         return self.flights.spread(w, *numbers).astype(int)
 
-    def _without_slack(self, flights: ReplayedFlights, ends: States) -> list[Cut]:
+    def _without_slack(self, ends: States) -> list[Cut]:
         """The windows, with the time in which the rope was slack until their ends cut out; those
         soon after it are marked so.
         """
         cuts: list[Cut] = []
         rings: dict[int, float] = {}  # flight -> until when
-        for w, c in enumerate(flights.cuts):
+        for w, c in enumerate(self.flights.cuts):
             first = float(ends["slack_first"][w])
             last = float(ends["slack_last"][w])
-            separation = flights.flights[c.flight].latch + self.setting.plant.release.lag
+            separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
                 c = dataclasses.replace(c, after_slack=True)
             if last < c.start:
