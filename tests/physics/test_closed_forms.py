@@ -79,23 +79,6 @@ def test_pendulum_period(amplitude):
     assert norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
 
 
-def test_motor_step():
-    """A step of the set-point:
-
-    ``1 - exp(-t / T)``; the set-point itself is the root of the thrust over k_f.
-    """
-    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
-    vehicle = replace(vehicle, queue=QueueParams(0.0))
-    sim = bare_quadrotor(vehicle, 1, "rk4", 0.001, precision="float64")
-    first = sim.get("motor_speed")[0, 0]
-    sim.set_command([[8.0, 0.0, 0.0, 0.0]])
-    last = np.sqrt(2.0 / vehicle.thrust.k_f)
-    for k in range(1, 6):
-        advance(sim, 1)
-        expected = last + (first - last) * np.exp(-0.02 * k / vehicle.motor.time_constant)
-        assert_allclose(sim.get("motor_speed")[0], expected, rtol=1e-8)
-
-
 def test_battery_counts_its_charge():
     """The used fraction grows by the current: power over voltage over capacity, in hover steady but
     for the sag.
@@ -114,35 +97,6 @@ def test_battery_counts_its_charge():
     advance(sim, 50)
     expected = power / voltage / 3600.0 / vehicle.battery.capacity
     assert sim.get("charge_used")[0] == approx(expected, rel=0.05)
-
-
-def test_gyroscopic_torques_do_no_work():
-    """Unpowered rotors on a tumbling body: its kinetic energy stays while the rotors bend its path.
-
-    Rotors at equal speeds would cancel; here two stand still. No thrust coefficient that matters,
-    no air: only Euler's equation and the rotors' momentum are left."""
-    base = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="first_order")
-    still = replace(base.motor, time_constant=1e30)
-    # No thrust worth the name, and motors that never reach a set-point; hover needs none because
-    # gravity is off.
-    weak = replace(base.thrust, k_f=1e-30)
-    idle = replace(base.controller, min_thrust=0.0, geometric_gain=0.0)
-    vehicle = replace(base, motor=still, thrust=weak, controller=idle)
-    rate = np.array([[6.0, -9.0, 4.0]])
-    inertia = np.array(vehicle.body.inertia)
-
-    def run(speeds):
-        sim = bare_quadrotor(vehicle, 1, "rk4", 0.0005, precision="float64", gravity=0.0)
-        sim.place(np.zeros((1, 3)), rate_b=rate)
-        sim.state.motor_speed.assign(np.array([speeds]))
-        advance(sim, 50)
-        return sim.get("rate_b")[0]
-
-    spun, plain = run([4000.0, 0.0, 0.0, 4000.0]), run([0.0, 0.0, 0.0, 0.0])
-    energy = 0.5 * np.sum(inertia * rate[0] ** 2)
-    for end in (spun, plain):
-        assert 0.5 * np.sum(inertia * end**2) == approx(energy, rel=1e-8)
-    assert norm(spun - plain) > 1.0, "the rotors must have turned the rate"
 
 
 def test_hover_is_an_equilibrium():

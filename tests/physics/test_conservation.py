@@ -1,6 +1,4 @@
-"""What a free chain of vehicle, rope and ball must keep: energy, linear momentum, its centre of
-mass in free fall.
-"""
+"""What a free chain of vehicle, rope and ball must keep: energy and linear momentum."""
 
 from dataclasses import replace
 
@@ -9,15 +7,13 @@ from pytest import approx, mark
 from scipy.spatial.transform import Rotation
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, LawParams
+from sim.params import LawParams
 from tests.plants import EVERYTHING, SCENES
 from tests.scenes import Wrench, load_scene
 from tests.simulators import energy, momentum, place_scene, scene_plant, scene_sim
 
 DRIFT = 5e-3
 """Of the energy in 1.2 s at 2 ms."""
-FALLS = 4.0
-"""A step half as long loses at least so much less: order 2."""
 ROUND_OFF = {"float32": 1e-5, "float64": 1e-12}
 """Momentum [kg m/s]; the rates below give 0.24 kg m/s."""
 ENERGY_ROUND_OFF = {"float32": 5e-6, "float64": 1e-12}
@@ -51,32 +47,19 @@ def free(**changes):
     return replace(scene, **{**start, **changes})
 
 
-def history(scene, substep, precision, **options):
-    """Energy, shape (T+1,), and momentum, shape (T+1, 3), at every control step."""
-    sim = scene_sim(scene, substep, precision, 0.02, **options)
-    sim.set_command(np.zeros((1, 4)))
-    energies, momenta = [energy(sim)[0]], [momentum(sim)[0]]
-    for _ in range(STEPS):
-        sim.step()
-        energies.append(energy(sim)[0])
-        momenta.append(momentum(sim)[0])
-    return np.array(energies), np.array(momenta)
-
-
 @mark.parametrize("precision", ["float32", "float64"])
 def test_free_chain_keeps_energy_and_momentum(precision):
-    scene = free()
-    energies, momenta = history(scene, 2e-3, precision, gravity=0.0)
-    lost = 1.0 - energies / energies[0]
+    sim = scene_sim(free(), 2e-3, precision, 0.02, gravity=0.0)
+    sim.set_command(np.zeros((1, 4)))
+    energies, momenta = [], []
+    for _ in range(STEPS):
+        energies.append(energy(sim)[0])
+        momenta.append(momentum(sim)[0])
+        sim.step()
+    lost = 1.0 - np.array(energies) / energies[0]
     assert np.abs(lost).max() < DRIFT
     assert lost.min() > -ENERGY_ROUND_OFF[precision], "energy grew"
-    assert np.abs(momenta - momenta[0]).max() < ROUND_OFF[precision]
-
-
-def test_energy_drift_falls_with_the_step():
-    ends = [history(free(), h, "float64", gravity=0.0)[0] for h in (2e-3, 1e-3, 5e-4)]
-    drifts = [np.abs(e / e[0] - 1.0).max() for e in ends]
-    assert drifts[0] > FALLS * drifts[1] > FALLS**2 * drifts[2] > 0.0
+    assert np.abs(np.array(momenta) - momenta[0]).max() < ROUND_OFF[precision]
 
 
 def relative_rates(sim):
@@ -128,16 +111,3 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
     moved = np.abs(rubbed - without)
     assert np.all(moved.reshape(3, 3).max(axis=1) > MOVED)
     assert np.abs(lawful - rubbed).max() < HELD * moved.max()
-
-
-@mark.parametrize("precision", ["float32", "float64"])
-def test_free_fall(precision):
-    """Whatever rope and vehicle do, the total momentum grows by m g t."""
-    scene = free()
-    _, momenta = history(scene, 2e-3, precision)
-    expected = momenta[0] - scene.total_mass * GRAVITY * 0.02 * np.arange(STEPS + 1)[
-        :, None
-    ] * np.array([0, 0, 1.0])
-    # It is carried through the step as one sum of up to 3 kg m/s, so its round-off is that of the
-    # sum.
-    np.testing.assert_allclose(momenta, expected, rtol=0.0, atol=3.0 * ROUND_OFF[precision])

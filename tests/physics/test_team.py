@@ -51,7 +51,7 @@ def hung(params: PlantParams, directions: np.ndarray, **options) -> TeamSim:
     return sim
 
 
-def commands(steps: int, rows: int, seed: int = 0) -> np.ndarray:
+def commands(steps: int, rows: int) -> np.ndarray:
     """Thrust [N] and rates [rad/s] that swing the load hard, the same for all."""
     time = 0.02 * np.arange(steps)
     one = [2.9 * (1.0 + 0.7 * np.sin(9.0 * time)), 2.0 * np.sin(5.0 * time)]
