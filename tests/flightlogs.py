@@ -51,8 +51,9 @@ def with_channels(log: FlightLog, **channels: Channel) -> FlightLog:
     return FlightLog(log.channels | channels, log.meta)
 
 
-def upright(up: np.ndarray, heading: np.ndarray) -> Rotation:
-    """Attitudes with the third axis along ``up`` and the first one nearest to ``heading``."""
+def upright(thrust: np.ndarray, heading=(1.0, 0.0, 0.0)) -> Rotation:
+    """Attitudes with the third axis along a thrust and the first one nearest to ``heading``."""
+    up = thrust / norm(thrust, axis=1, keepdims=True)
     side = np.cross(up, heading)
     side /= norm(side, axis=1, keepdims=True)
     return Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
@@ -78,10 +79,9 @@ def flight(
         vel[:, axis] += a * w * np.cos(w * time + phase)
         acc[:, axis] -= a * w * w * np.sin(w * time + phase)
     force = acc + [0, 0, G]
-    up = force / norm(force, axis=1, keepdims=True)
     yaw = np.sin(rng.uniform(0.5, 0.9) * time + rng.uniform(0, 6))
     heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
-    turn = upright(up, heading)
+    turn = upright(force, heading)
     rates = np.zeros((len(time), 3))
     rates[1:-1] = (turn[:-2].inv() * turn[2:]).as_rotvec() * rate / 2.0
     rates[0], rates[-1] = rates[1], rates[-2]

@@ -1,9 +1,13 @@
 """Lenses that the tests of the fisheye model share, and a camera of any lens."""
 
+from functools import partial
+
+import torch
 from pytest import mark
 
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
+f64 = partial(torch.tensor, dtype=torch.float64)
 EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)
 NARROW = FisheyeParams(

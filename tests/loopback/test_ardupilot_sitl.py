@@ -74,6 +74,11 @@ def fly(bridge, frames):
     return other.states
 
 
+def rise(bridge):
+    """Fly a hundred frames of a little more than hover."""
+    fly(bridge, [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)])
+
+
 def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
     """A frame that comes again moves nothing; time goes by the period; the vehicle stands until its
     rotors carry it.
@@ -100,7 +105,7 @@ def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
 )
 def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge, change, axis):
     """Outputs are front right, rear left, front left, rear right; rates forward, right, down."""
-    fly(bridge, [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)])
+    rise(bridge)
     assert not bridge.plant.held
     states = fly(bridge, [(200 + n, servos(*(HOVER + 20 + np.array(change)))) for n in range(25)])
     told = np.array(states[-1]["imu"]["gyro"])
@@ -109,7 +114,7 @@ def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge, change, axis):
 
 
 def test_the_mechanisms_output_lets_the_ball_go(bridge):
-    fly(bridge, [(n, servos(*[HOVER + 20] * 4)) for n in range(1, 101)])
+    rise(bridge)
     fly(bridge, [(101 + n, servos(*[HOVER + 20] * 4, hook=1100)) for n in range(60)])
     report = bridge.report()
     assert report["releases"] == 1

@@ -281,14 +281,10 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, printed)
     assert flown["error_mean"] < 0.04 < trained["error_mean"], "four times the noise must show"
 
 
-def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
-    words = [*SMALL, "ppo.segments=5", "ppo.substep=0.004"]
-    experiment = load_experiment("laptop", words)
-    run = Trainer(experiment, "cpu", 1)
-    coarse = run.algorithm.env.cfg
+def test_ppo_trains_in_a_simulator_as_coarse_as_it_asks_for():
+    experiment = load_experiment("laptop", [*SMALL, "ppo.segments=5", "ppo.substep=0.004"])
+    coarse = Trainer(experiment, "cpu", 1).algorithm.env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
-    assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
-    assert run.experiment == experiment
 
 
 def test_the_policy_of_ppo_has_the_mean_of_the_last_iterations_weights():

@@ -4,7 +4,6 @@ what nuisances do.
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -24,12 +23,10 @@ from camera.detectors.contours import (
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
-from tests.lenses import camera_of
+from tests.lenses import camera_of, f64
 from visthrow.detector_training.eyes import render_hall
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import posed_scenes
-
-f64 = partial(torch.tensor, dtype=torch.float64)
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -10,9 +9,7 @@ from pytest import mark, raises
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
-from tests.lenses import BENT, EQUIDISTANT, LENSES
-
-f64 = partial(torch.tensor, dtype=torch.float64)
+from tests.lenses import BENT, EQUIDISTANT, LENSES, f64
 
 ANGLE_TOLERANCE = 1e-9  # rad; the bar of the model, 1e6 times the rounding of float64
 EDGE_TOLERANCE = 1e-12  # rounding of a dozen float64 operations on values near 1

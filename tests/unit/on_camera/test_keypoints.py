@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import torch
 from pytest import approx, mark
@@ -18,8 +17,7 @@ from camera.keypoints import (
 )
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
-
-f64 = partial(torch.tensor, dtype=torch.float64)
+from tests.lenses import f64
 
 LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 PARAMS = CameraParams(

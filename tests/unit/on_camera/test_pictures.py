@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -14,9 +13,7 @@ from camera.overlay import draw_overlay
 from camera.params import FisheyeParams
 from camera.rectify import ViewParams, rectify, view_map
 from tests.boards import pixel_rays
-from tests.lenses import camera_of
-
-f64 = partial(torch.tensor, dtype=torch.float64)
+from tests.lenses import camera_of, f64
 
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
 CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)

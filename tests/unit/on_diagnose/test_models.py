@@ -328,6 +328,14 @@ class TestFlyer:
         bad = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(nothing, right)]) ** 2))
         assert good < 0.1 * bad
 
+    @staticmethod
+    def carried(place: list[float], rise=0.0) -> FlightLog:
+        """Four seconds at a place, under the vehicle's weight and a share more each second."""
+        time = np.arange(0.0, 4.0, 0.01)
+        thrust = FLYER.mass * G * (1.0 + rise * time[:, None])
+        log = level_log(time, np.tile(place, (len(time), 1)))
+        return with_channels(log, thrust_command=Channel(time, thrust, "N"))
+
     @mark.parametrize(
         ("name", "size", "expected"),
         [
@@ -341,10 +349,7 @@ class TestFlyer:
     )
     def test_effects_push_a_hovering_vehicle_as_their_equations_say(self, name, size, expected):
         """Closed form: half the acceleration that an effect makes times the time squared."""
-        time = np.arange(0.0, 3.0, 0.01)
-        log = level_log(time, np.tile([0.0, 0.0, 2.0], (len(time), 1)))
-        weight = Channel(time, np.full((len(time), 1), FLYER.mass * G), "N")
-        model = FlyerModel([with_channels(log, thrust_command=weight)], DRIVEN_BY_THRUST)
+        model = FlyerModel([self.carried([0.0, 0.0, 2.0])], DRIVEN_BY_THRUST)
         seen = []
         for theta in ({}, {name: size}):
             lanes = model._lanes(model.size(theta))
@@ -356,13 +361,10 @@ class TestFlyer:
         )  # the angle squared
 
     def test_a_neighbour_is_measured_in_the_tilted_frame_too(self):
-        time = np.arange(0.0, 3.0, 0.01)
-        place = np.tile([3.0, 0.0, 2.0], (len(time), 1))
-        log = level_log(time, place)
-        above = Channel(time, place + [0.0, 0.0, 1.0], "m", "world")
-        weight = Channel(time, np.full((len(time), 1), FLYER.mass * G), "N")
-        log = with_channels(log, thrust_command=weight, neighbour_pos_w=above)
-        model = FlyerModel([log], DRIVEN_BY_THRUST)
+        log = self.carried([3.0, 0.0, 2.0])
+        place = log["pos_w"]
+        above = replace(place, values=place.values + [0.0, 0.0, 1.0])
+        model = FlyerModel([with_channels(log, neighbour_pos_w=above)], DRIVEN_BY_THRUST)
         lanes = model._lanes(model.size({"frame_tilt_y": 0.05}))
         (knots, *_) = model.knots(lanes, model.simulate(lanes))
         begins = knots["pos_w"][0] - knots["neighbour_pos_w"][0]
@@ -370,11 +372,8 @@ class TestFlyer:
 
     @mark.parametrize("step", [0.02, 0.03, 0.06])
     def test_thrusts_keep_their_time_where_no_number_of_steps_fills_the_window(self, step):
-        time = np.arange(0.0, 4.0, 0.01)
-        log = level_log(time, np.tile([0.0, 0.0, 2.0], (len(time), 1)))
-        rising = Channel(time, FLYER.mass * G * (1.0 + 0.1 * time[:, None]), "N")
         params = replace(DRIVEN_BY_THRUST, motor_time_constant=0.001, step=step)
-        model = FlyerModel([with_channels(log, thrust_command=rising)], params)
+        model = FlyerModel([self.carried([0.0, 0.0, 2.0], rise=0.1)], params)
         driven = model._commands(model._lanes(model.size({})))
         since = driven["command_time"][0] + 0.5 * model.row
         held = (driven["command"][0].sum(1) / (FLYER.mass * G) - 1.0) / 0.1
@@ -404,9 +403,9 @@ class TestFlyer:
 class TestImu:
     """Motors' commands, accelerometer and gyro, and nothing else."""
 
-    def log(self, *drawn) -> FlightLog:
-        """Return a copy of a flight: a test may change it."""
-        return deepcopy(self.flight(*drawn))
+    def logs(self, *drawn) -> list[FlightLog]:
+        """Return copies of two flights: a test may change them."""
+        return [deepcopy(self.flight(*drawn, seed)) for seed in range(2)]
 
     @staticmethod
     @cache
@@ -450,7 +449,7 @@ class TestImu:
 
     def test_lag_curve_and_inertia_without_a_position(self):
         truth = {"motor_tau": 0.02, "thrust_curve": 0.2, "inertia_xy": 0.3, "inertia_z": -0.2}
-        logs = [self.log(0.05, 0.2, (0.3, -0.2), seed) for seed in range(2)]
+        logs = self.logs(0.05, 0.2, (0.3, -0.2))
         model = ImuModel(logs, IMU)
         fitted = fitting.fit(model, [*fitting.DEFAULT_FREE["imu"]])
         found = dict(zip(fitted.names, fitted.theta))
@@ -460,7 +459,7 @@ class TestImu:
             assert sd[name] < 0.15 * abs(size), name
 
     def test_a_voltage_that_only_some_logs_hold_is_not_used(self):
-        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(2)]
+        logs = self.logs(0.05, 0.0, (0.0, 0.0))
         assert not ImuModel(logs, IMU).notes
         logs[0].channels["battery_voltage"] = Channel(np.arange(9.0), np.full(9, 3.8), "V")
         model = ImuModel(logs, IMU)
@@ -468,7 +467,7 @@ class TestImu:
         assert model.notes == ("battery_voltage is not used: only 1 of 2 logs hold it",)
 
     def test_torques_are_left_out_where_the_air_turns_the_vehicle(self):
-        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(2)]
+        logs = self.logs(0.05, 0.0, (0.0, 0.0))
         for log in logs:
             rate = log["rate_b"]
             rate.values[:] += 40.0 * np.sin(4.0 * rate.time)[:, None] * [1.0, -1.0, 0.5]

@@ -33,14 +33,14 @@ PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
 LEAST = 4.0
 
 
-def chosen_of(statistics, days=()):
+def chosen_of(statistics, days=(), effects=EFFECTS, priors=PRIORS, least=LEAST):
     """Return the best set of candidates, and the deviations of its random shares in their unit."""
-    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, statistics, days)
-    linear = Linear(statistics, PRIORS, offered, lambda s: sum(LEAST + c.penalty for c in s), days)
+    offered = shared(effects) + random_shares(effects, priors, statistics, days)
+    linear = Linear(statistics, priors, offered, lambda s: sum(least + c.penalty for c in s), days)
     near = window(linear, {NOTHING})
     best = max(near, key=near.get)
     sizes = {
-        c.name: size * c.deviations[0] * PRIORS.floor[c.columns[0]]
+        c.name: size * c.deviations[0] * priors.floor[c.columns[0]]
         for c, size in linear.shares(best)[0].items()
     }
     return best, sizes

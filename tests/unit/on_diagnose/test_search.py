@@ -9,20 +9,15 @@ from numpy.random import default_rng
 from pytest import approx, mark, raises
 
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
+from tests.unit.on_diagnose.test_scatter import chosen_of
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import diagnose_flights, held_out, result
-from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
-from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.point import Problem, linearise
 from visthrow.diagnose.select.selection import Selector
-
-
-def world(**options) -> SyntheticModel:
-    return SyntheticModel(**options)
 
 
 def sizes(model, diagnosis) -> dict[str, float]:
@@ -51,7 +46,7 @@ def pushed(model, window, size: float):
 
 
 def test_nothing_is_found_where_nothing_is():
-    diagnosis = diagnose_flights.explain(world())
+    diagnosis = diagnose_flights.explain(SyntheticModel())
     assert diagnosis.overall == result.NO_EFFECT
     assert not diagnosis.theta
     assert not diagnosis.events
@@ -61,7 +56,7 @@ def test_nothing_is_found_where_nothing_is():
 
 @mark.parametrize("sign", [1.0, -1.0])
 def test_one_effect_is_named_with_its_size_and_interval(sign):
-    model = world(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
+    model = SyntheticModel(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
     diagnosis = explain_without_laws(model)
     assert diagnosis.overall == result.KNOWN
     found = diagnosis["effect_03"]
@@ -79,7 +74,7 @@ TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
 @mark.parametrize("curvature", [0.0, 2.0])
 def test_three_effects_are_named_also_where_bends_would_fake_one(curvature):
     """A bend of 2 at 30 floors is taken for more than a third of each size."""
-    model = world(truth=TRIPLE, seed=1, curvature=curvature)
+    model = SyntheticModel(truth=TRIPLE, seed=1, curvature=curvature)
     diagnosis = explain_without_laws(model)
     assert set(diagnosis.named) == set(TRIPLE)
     for name, size in sizes(model, diagnosis).items():
@@ -115,7 +110,9 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
 
 
 def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
-    model = world(truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
+    model = SyntheticModel(
+        truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
+    )
     diagnosis = explain_without_laws(model)
     group = [f for f in diagnosis.findings if f.verdict == result.CLASS]
     assert {f.name for f in group} == {"effect_03", "effect_07"}
@@ -128,7 +125,7 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
 
 
 def test_a_missing_channel_makes_effects_unobservable_and_names_it():
-    model = world(truth={"effect_03": 12.0}, seed=2)
+    model = SyntheticModel(truth={"effect_03": 12.0}, seed=2)
     model.effects = tuple(
         replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS
     )
@@ -190,11 +187,8 @@ def best_set(sizes) -> set[str]:
         np.arange(len(sizes)), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
     )
     effects = [replace(EFFECTS[3], prior_sd=20.0, floor=1.0)]
-    offered = shared(effects) + random_shares(effects, priors, statistics, ())
-    near = window(
-        Linear(statistics, priors, offered, lambda s: sum(5.0 + c.penalty for c in s)), {NOTHING}
-    )
-    return {c.name for c in max(near, key=near.get)}
+    best, _ = chosen_of(statistics, effects=effects, priors=priors, least=5.0)
+    return {c.name for c in best}
 
 
 @mark.parametrize(
@@ -214,19 +208,19 @@ def test_what_flights_share_and_what_each_has_for_itself_are_weighed_alike(sizes
 
 
 def test_gusts_are_no_causes():
-    assert not explain_without_laws(world(gust=2.0, seed=7)).theta
+    assert not explain_without_laws(SyntheticModel(gust=2.0, seed=7)).theta
 
 
 def test_causes_at_their_floors_are_not_named():
     signs = default_rng(3).choice([-1.0, 1.0], len(EFFECTS))
     truth = {e.name: sign for e, sign in zip(EFFECTS, signs)}
-    model = world(truth=truth, seed=3, gust=0.3, noise=0.5)
+    model = SyntheticModel(truth=truth, seed=3, gust=0.3, noise=0.5)
     assert not explain_without_laws(model).theta
 
 
 def test_commands_of_other_flights_are_inconsistent_data():
     """Poses that have nothing to do with the commands leave forces of the order of the thrust."""
-    diagnosis = diagnose_flights.explain(world(gust=80.0))
+    diagnosis = diagnose_flights.explain(SyntheticModel(gust=80.0))
     assert diagnosis.overall == result.INCONSISTENT
     assert not diagnosis.theta
 
@@ -252,7 +246,7 @@ def test_a_few_windows_that_fail_are_left_out_and_counted():
 
 
 def test_an_estimate_stays_within_its_physical_bounds():
-    model = world(truth={"effect_03": 12.0}, seed=2)
+    model = SyntheticModel(truth={"effect_03": 12.0}, seed=2)
     floor = EFFECTS[3].floor
     model.effects = tuple(
         replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS
@@ -269,7 +263,7 @@ def test_an_estimate_stays_within_its_physical_bounds():
 
 
 def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
-    model = world(truth={"effect_03": -5.0}, seed=2)
+    model = SyntheticModel(truth={"effect_03": -5.0}, seed=2)
     model.effects = tuple(
         replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS
     )
@@ -283,7 +277,7 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
 
 
 def test_no_window_is_an_error_that_says_so():
-    empty = world()
+    empty = SyntheticModel()
     empty._windows = []
     with raises(DiagnoseError, match="no stretch of flight"):
         diagnose_flights.explain(empty)
@@ -396,7 +390,7 @@ def test_a_window_that_no_force_explains_is_left_out():
 
 
 def test_a_set_that_was_the_best_before_stays_possible():
-    model = world(truth={"effect_06": 15.0}, seed=4)
+    model = SyntheticModel(truth={"effect_06": 15.0}, seed=4)
     for w in model._windows:  # hardly to be told from it
         w.effects[:, 8] = w.effects[:, 6] + 0.03 * w.effects[:, 3]
     problem = Problem.of(model, model.windows({}), range(14))

@@ -9,18 +9,20 @@ from hil.control.tick.dead_reckoning import RESPONSE, DeadReckoning
 from hil.poses.body_track import BodyState
 
 TICK, AGE, MASS = 0.02, 0.01, 0.27
+STILL = (0.0,) * 4
+"""Command of no thrust and no rates."""
 
 
-def estimate(time: float, age: float, rate=(0.0, 0.0, 0.0)) -> Estimate:
+def estimate(time: float, age: float) -> Estimate:
     """A vehicle whose last pose came an age ago [s], as the tracks repeat it."""
-    vehicle = BodyState((0.0, 0.0, 1.3), (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.5), rate, age)
+    vehicle = BodyState((0.0, 0.0, 1.3), (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.5), (0.0,) * 3, age)
     return Estimate(time, vehicle, None, None, 0, 0, 0, AGE + age)
 
 
-def carried(ticks, rates, command) -> DeadReckoning:
+def carried(ticks=10, rates=lambda n: None, command=STILL) -> DeadReckoning:
     reckoning = DeadReckoning()
     for n in range(ticks + 1):
-        reckoning.update(estimate(n * TICK, n * TICK, (0.0, 0.0, 0.0)), rates(n), command, MASS)
+        reckoning.update(estimate(n * TICK, n * TICK), rates(n), command, MASS)
     return reckoning
 
 
@@ -28,29 +30,29 @@ def carried(ticks, rates, command) -> DeadReckoning:
 def test_reported_rates_turn_the_attitude(axis):
     """From the time of the pose on; reports are told apart by a last digit."""
     rates = lambda n: tuple(3.0 + 1e-9 * n if i == axis else 0.0 for i in range(3))  # noqa: E731
-    reckoning = carried(10, rates, (0.0, 0.0, 0.0, 0.0))
+    reckoning = carried(rates=rates)
     angle = 2.0 * math.atan2(reckoning.state.quat[axis], reckoning.state.quat[3])
     assert angle == approx(3.0 * (10 * TICK + AGE), abs=2e-3)
     assert reckoning.duration == approx(10 * TICK + AGE)
 
 
 def test_without_reports_the_rates_follow_the_command():
-    reckoning = carried(5, lambda n: None, (0.0, 2.0, 0.0, 0.0))
+    reckoning = carried(5, command=(0.0, 2.0, 0.0, 0.0))
     share = 1.0 - math.exp(-(5 * TICK + AGE) / RESPONSE)
     assert reckoning.state.rate == approx((2.0 * share, 0.0, 0.0))
 
 
 def test_a_vehicle_without_thrust_falls_and_one_with_its_weight_goes_on():
     time = 10 * TICK + AGE
-    falls = carried(10, lambda n: None, (0.0, 0.0, 0.0, 0.0)).state
+    falls = carried().state
     assert falls.vel == approx((1.0, 0.0, 0.5 - 9.81 * time), abs=1e-3)
-    goes_on = carried(10, lambda n: None, (MASS * 9.81, 0.0, 0.0, 0.0)).state
+    goes_on = carried(command=(MASS * 9.81, 0.0, 0.0, 0.0)).state
     assert goes_on.vel == approx((1.0, 0.0, 0.5), abs=1e-3)
     assert goes_on.pos == approx((time, 0.0, 1.3 + 0.5 * time), abs=1e-3)
 
 
 def test_a_new_pose_begins_anew():
-    reckoning = carried(10, lambda n: None, (0.0, 0.0, 0.0, 0.0))
-    reckoning.update(estimate(11 * TICK, 0.0), None, (0.0, 0.0, 0.0, 0.0), MASS)
+    reckoning = carried()
+    reckoning.update(estimate(11 * TICK, 0.0), None, STILL, MASS)
     assert reckoning.state.vel == (1.0, 0.0, 0.5)
     assert reckoning.duration == 0.0

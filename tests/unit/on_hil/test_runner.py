@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from pytest import approx, mark, raises
+from pytest import approx, mark
 
 from hil.control.hovering import Hovering
 from hil.control.state_machine import Inputs, Machine
@@ -15,9 +15,7 @@ from hil.control.tick.runner import OperatorInput, Runner
 from hil.links.backends.base import HOLD, Status
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
-from tests.configs import load_run
 from tests.hil_flight import HOVER, TICK, Spy, changes, fly, params, simple_policy
-from visthrow.common.errors import ConfigError
 
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
 AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
@@ -401,35 +399,6 @@ def test_a_release_outside_of_the_fence_is_refused():
     decisions = fly(pilot, 5.0, watch=watch)
     safe(pilot, decisions)
     assert not pilot.backend.release_times
-
-
-@mark.parametrize(
-    ("override", "message"),
-    [
-        ("gate.hold=0.01", "ascending"),
-        ("throws=0", "expected 1 or more"),
-        ('source.kind="csv"', "expected the file of the csv source"),
-        ('frames.vehicle.axes="x,y,-z"', "mirror the world"),
-        ('backend="px5"', "one of 'dry-run', 'ardupilot', 'px4', 'betaflight'"),
-        ("gaol_w=[1.0]", "did you mean 'goal_w'"),
-        ("guard.slew_thrust=0.0", "above 0"),
-        ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
-        ("states.armed=-1.0", "armed is -1.0; expected above 0"),
-        ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
-        (
-            "goal_w=[9.0, 0.0, 0.0]",
-            (
-                r"goal_w \(9.0, .* expected within the payload's fence, \(-3.0, -3.0, -0.05\) to"
-                r" \(3.0, 3.0, 3.0\)"
-            ),
-        ),
-        ("landing_height=-3.0", "expected within the payload's fence"),
-        ("link.system=300", "expected 1 to 255"),
-    ],
-)
-def test_wrong_configs(override, message):
-    with raises(ConfigError, match=message):
-        load_run("dry_run", [override])
 
 
 class HoldingSpy(Spy):

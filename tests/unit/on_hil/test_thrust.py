@@ -68,6 +68,8 @@ def test_too_few_values_measure_nothing():
             r"gives 7\.\d+ N at most, the policy was trained with 14 N",
         ),
         ("fake_px4", "px4.thrust.slope=0.7", "gives 12.* N at most"),
+        ("fake", "ardupilot.thrust.weight=1.334", "is 0.50 times the weight that the policy was"),
+        ("fake_crazyflie", "crazyflie.thrust.weight=5.336", "is 2.00 times the weight"),
         ("fake_betaflight", "betaflight.rates.rc_rates=[40, 60, 30]", None),
         ("fake_betaflight", "betaflight.rates.rates=[60, 60, 20]", None),
     ],

@@ -1,4 +1,4 @@
-"""Wrong vehicles in a config, and ports that a back-end must not open."""
+"""Wrong vehicles, guards and fences in a config, and ports that a back-end must not open."""
 
 from pytest import mark, raises
 
@@ -34,9 +34,28 @@ def load(*overrides, name="dry_run"):
         ("betaflight.rates.expo=[0, 0, 101]", r"rates: expo is \(0, 0, 101\); expected 0 to 100"),
         ("betaflight.thrust.hover=1.5", "hover is 1.5; expected above 0 and below 1"),
         ("px4.thurst.hover=0.2", "did you mean 'thrust'"),
+        ("gate.hold=0.01", "ascending"),
+        ("throws=0", "expected 1 or more"),
+        ('source.kind="csv"', "expected the file of the csv source"),
+        ('frames.vehicle.axes="x,y,-z"', "mirror the world"),
+        ('backend="px5"', "one of 'dry-run', 'ardupilot', 'px4', 'betaflight'"),
+        ("gaol_w=[1.0]", "did you mean 'goal_w'"),
+        ("guard.slew_thrust=0.0", "above 0"),
+        ("fence.vehicle_low=[9.0, 0.0, 0.0]", "ascending corners"),
+        ("states.armed=-1.0", "armed is -1.0; expected above 0"),
+        ("home_w=[0.0, 0.0, 30.0]", "expected within the vehicle's fence"),
+        (
+            "goal_w=[9.0, 0.0, 0.0]",
+            (
+                r"goal_w \(9.0, .* expected within the payload's fence, \(-3.0, -3.0, -0.05\) to"
+                r" \(3.0, 3.0, 3.0\)"
+            ),
+        ),
+        ("landing_height=-3.0", "expected within the payload's fence"),
+        ("link.system=300", "expected 1 to 255"),
     ],
 )
-def test_wrong_vehicles(override, message):
+def test_wrong_configs(override, message):
     with raises(ConfigError, match=message):
         load(override)
 

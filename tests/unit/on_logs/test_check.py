@@ -252,8 +252,7 @@ def carrying() -> dict[str, np.ndarray]:
     hung = pull(below)
     above = below + 0.5 * hung / norm(hung, axis=1, keepdims=True)
     thrust = 0.8 * pull(above) + 0.2 * hung
-    up = thrust / norm(thrust, axis=1, keepdims=True)
-    turn = upright(up, [1.0, 0.0, 0.0])
+    turn = upright(thrust)
     rng = default_rng(3)
     columns = {"time": time, "pos_w": above, "payload_pos_w": below}
     noisy = {n: v + rng.normal(0, 3e-4, v.shape) for n, v in columns.items() if n != "time"}
@@ -661,7 +660,7 @@ def test_an_accelerometer_that_its_own_axes_fit_is_not_exchanged(turned_deg, exc
     vel = np.sin(turns)
     acc = np.gradient(vel, time, axis=0) + [0.0, 0.0, G]
     thrust = acc + 0.4 * vel  # against the rotors' drag
-    turn = upright(thrust / norm(thrust, axis=1, keepdims=True), [1.0, 0.0, 0.0])
+    turn = upright(thrust)
     force = turn.inv().apply(acc) + default_rng(4).normal(0.0, 0.2, acc.shape)
     force = Rotation.from_euler("z", turned_deg, degrees=True).apply(force)
     pos = np.cumsum(vel, axis=0) * 0.01
@@ -675,7 +674,7 @@ def test_a_payload_that_swings_in_circles_exchanges_no_axes():
     circle = np.column_stack([np.cos(6.0 * time), np.sin(6.0 * time), np.zeros_like(time)])
     force_w = circle + [0.0, 0.0, G]
     thrust = force_w - 0.12 * circle  # less the cable's pull
-    turn = upright(thrust / norm(thrust, axis=1, keepdims=True), [1.0, 0.0, 0.0])
+    turn = upright(thrust)
     force = turn.inv().apply(force_w) + default_rng(5).normal(0.0, 0.1, force_w.shape)
     late = 6.0 * (time - 0.08)
     vel = np.column_stack([np.sin(late), -np.cos(late), np.zeros_like(time)]) / 6.0

@@ -178,6 +178,9 @@ class TestBlackbox:
             read(path)
 
 
+PLACE = ChannelMap("x", ("v",), "m")
+
+
 def mapping(*channels: ChannelMap, **more) -> TableMap:
     return TableMap(TimeColumn("t", "ms"), channels, **more)
 
@@ -228,10 +231,9 @@ class TestTables:
         assert Rotation.from_quat(log["quat_wb"].values[0]).apply(vector) == approx(expected)
 
     def test_angles_turn_yaw_first(self, tmp_path):
-        (log,) = read(
-            written(tmp_path, ["t,r,p,y", *(f"{i},10,20,30" for i in range(3))]),
-            mapping(ChannelMap("quat_wb", ("r", "p", "y"), "deg", "euler")),
-        )
+        rows = ["t,r,p,y", *(f"{i},10,20,30" for i in range(3))]
+        angles = ChannelMap("quat_wb", ("r", "p", "y"), "deg", "euler")
+        (log,) = read_rows(tmp_path, rows, angles)
         yaw, pitch, roll = (
             Rotation.from_euler(axis, angle, degrees=True)
             for axis, angle in (("z", 30), ("y", 20), ("x", 10))
@@ -241,7 +243,7 @@ class TestTables:
 
     def test_what_a_clock_does_wrong_is_counted_and_left_out(self, tmp_path):
         rows = ["t,v", "0,1", "10,2", "10,3", "20,4", "5,5", "30,", ",7", "40,8"]
-        (log,) = read_rows(tmp_path, rows, ChannelMap("x", ("v",), "m"))
+        (log,) = read_rows(tmp_path, rows, PLACE)
         notes = log.meta["ingest"]["x"]
         assert log["x"].time == approx([0, 0.01, 0.02, 0.04])
         assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (
@@ -302,14 +304,13 @@ class TestTables:
 
     def test_clocks_of_their_own_and_splits(self, tmp_path):
         rows = ["t,u,b,v", *(f"{10 * i},{2 * i},{'ab'[i // 50]},{i}" for i in range(100))]
-        logs = read(
-            written(tmp_path, rows),
-            mapping(
-                ChannelMap("x", ("v",), "m", clock="other"),
-                ChannelMap("y", ("v",), "m"),
-                clocks={"other": TimeColumn("u", "s")},
-                split=Split("b"),
-            ),
+        logs = read_rows(
+            tmp_path,
+            rows,
+            ChannelMap("x", ("v",), "m", clock="other"),
+            ChannelMap("y", ("v",), "m"),
+            clocks={"other": TimeColumn("u", "s")},
+            split=Split("b"),
         )
         assert [log.meta["part"] for log in logs] == ["a", "b"]
         path = tmp_path / "a.csv"
@@ -331,7 +332,7 @@ class TestTables:
     )
     def test_clocks(self, clock, times, tmp_path):
         path = written(tmp_path, ["t,v", "0,1", "10,2", "30,3"])
-        (log,) = read(path, TableMap(clock, (ChannelMap("x", ("v",), "m"),)))
+        (log,) = read(path, TableMap(clock, (PLACE,)))
         assert log["x"].time == approx(times)
 
     @mark.parametrize(
@@ -342,8 +343,7 @@ class TestTables:
         """Stretches of 20, 10 and 30 ms, gaps of 60 and 80 ms."""
         stamps = [0, 10, 20, 80, 90, 170, 180, 190, 200]
         rows = ["t,v", *(f"{stamp},{i}" for i, stamp in enumerate(stamps, start=1))]
-        rule = mapping(ChannelMap("x", ("v",), "m"), split=Split(gap=gap, shortest=shortest))
-        logs = read(written(tmp_path, rows), rule)
+        logs = read_rows(tmp_path, rows, PLACE, split=Split(gap=gap, shortest=shortest))
         assert [log["x"].values[0] for log in logs] == firsts
 
     def test_export_comes_back(self, tmp_path):
@@ -375,13 +375,13 @@ class TestTables:
     )
     def test_bad_tables(self, tmp_path, rows, message):
         with raises(LogError, match=message):
-            read_rows(tmp_path, rows, ChannelMap("x", ("v",), "m"))
+            read_rows(tmp_path, rows, PLACE)
 
     def test_damaged_files(self, tmp_path):
         path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
         path.write_bytes(path.read_bytes()[:200])
         with raises(LogError, match="cannot be read"):
-            read(path, mapping(ChannelMap("x", ("v",), "m")))
+            read(path, mapping(PLACE))
         (tmp_path / "a.parquet").write_bytes(b"PAR1 no")
         with raises(LogError, match="parquet"):
             read(tmp_path / "a.parquet")
