@@ -10,8 +10,8 @@ from scipy.special import ellipk
 
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
-from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
-from tests.plants import paper_plant, plain_plant, plain_vehicle
+from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams, changed
+from tests.plants import EVERYTHING, paper_plant, plain_vehicle
 from tests.simulators import bare_quadrotor, numerics, rods
 
 PERIOD = 1e-4
@@ -29,11 +29,11 @@ def held(plant: PlantParams, **rope) -> HybridSim:
     body = BodyParams(HELD, (0.01 * HELD,) * 3)
     strong = replace(plant.vehicle.controller, max_thrust=HELD * GRAVITY)
     vehicle = replace(plant.vehicle, body=body, controller=strong, queue=QueueParams(0.0))
-    changed = replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
+    hung = replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
     sim = HybridSim(
-        PlantParams(vehicle, changed, plant.release, numerics(0.002, "float64")), 1, direct=True
+        PlantParams(vehicle, hung, plant.release, numerics(0.002, "float64")), 1, direct=True
     )
-    load = HELD + changed.rope_mass + changed.payload_mass
+    load = HELD + hung.rope_mass + hung.payload_mass
     sim.set_command([[load * GRAVITY, 0.0, 0.0, 0.0]])
     return sim
 
@@ -100,11 +100,17 @@ def test_battery_counts_its_charge():
 
 
 def test_hover_is_an_equilibrium():
-    """What a reset leaves is steady where the battery is ideal; with a real one the voltage's
-    compensation is not.
+    """What a reset leaves is steady where the voltage does nothing; with a real battery its
+    compensation is not. The kernel is the one of all tests of extensions.
     """
-    plant = replace(plain_plant(), sim=numerics(precision="float64"))
-    sim = HybridSim(plant, 1, extensions=frozenset({"push"}))
+    changes = {
+        "vehicle.thrust.voltage_coefficient": 0.0,
+        "vehicle.controller.voltage_compensation": 1.0,
+        "rope.segments": 5,
+        "sim.precision": "float64",
+    }
+    plant = changed(paper_plant(), changes)
+    sim = HybridSim(plant, 1, extensions=EVERYTHING)
     sim.place(np.array([[0.0, 0.0, 2.0]]))
     sim.set_command([[GRAVITY * plant.total_mass, 0.0, 0.0, 0.0]])
     advance(sim, 50)
