@@ -350,8 +350,8 @@ class Fake(ABC):
 
     def hold(self, goal_w: np.ndarray) -> np.ndarray:
         """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
-        now = self.plant.state
-        views = [now[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
+        state = self.plant.state
+        views = [state[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
 
     def descend(self) -> np.ndarray:

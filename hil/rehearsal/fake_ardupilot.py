@@ -82,13 +82,13 @@ class FakeArduPilot(FakeMavlink):
     def _meant(self, target: np.ndarray) -> np.ndarray:
         """Return the set-point as the parameters make it mean."""
         out = target.copy()
-        now = self.plant.state
+        state = self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FACTS["climb_rate"] * (2.0 * target[0] / self.plant.max_thrust - 1.0)
             out[0] = self.weight() * (
-                1.0 + FACTS["climb_gain"] * (climb - now["vel_w"][2]) / GRAVITY
+                1.0 + FACTS["climb_gain"] * (climb - state["vel_w"][2]) / GRAVITY
             )
         elif self.parameters["ATC_ANGLE_BOOST"]:
-            out[0] /= max(matrix_of_quat(now["quat_wb"][None].astype(float))[0, 2, 2], 0.5)
+            out[0] /= max(matrix_of_quat(state["quat_wb"][None].astype(float))[0, 2, 2], 0.5)
         out[0] = min(max(out[0], 0.0), self.plant.max_thrust)
         return out

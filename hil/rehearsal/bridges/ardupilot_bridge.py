@@ -58,7 +58,7 @@ def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
 
 def state_line(time: float, plant: MotorPlant) -> bytes:
     """The state of a vehicle as ArduPilot takes it, a line of JSON between two line feeds."""
-    now = plant.state
+    vehicle = plant.state
     x, y, z, w = plant.quat_wb.tolist()
     state = {
         "timestamp": time,
@@ -66,8 +66,8 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
             "gyro": (FLIP * plant.rate_b).tolist(),
             "accel_body": (FLIP * plant.force_b).tolist(),
         },
-        "position": (FLIP * now["pos_w"]).tolist(),
-        "velocity": (FLIP * now["vel_w"]).tolist(),
+        "position": (FLIP * vehicle["pos_w"]).tolist(),
+        "velocity": (FLIP * vehicle["vel_w"]).tolist(),
         "quaternion": [w, x, -y, -z],
         "battery": {"voltage": plant.voltage, "current": 0.0},
     }

@@ -186,12 +186,12 @@ class HangingBall:
 
     @property
     def state(self) -> dict[str, np.ndarray]:
-        now = self._now
+        vehicle = self._now
         return {
-            "pos_w": now.pos,
-            "quat_wb": now.quat,
-            "vel_w": now.vel,
-            "rate_b": now.rate,
+            "pos_w": vehicle.pos,
+            "quat_wb": vehicle.quat,
+            "vel_w": vehicle.vel,
+            "rate_b": vehicle.rate,
             "payload_pos_w": self._ball,
             "attached": np.array(self.attached),
         }

@@ -156,7 +156,7 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         return
     correlations = list(_correlations(log, command))
     if correlations:
-        yield _following(name, *max(correlations, key=lambda found: np.max(found[1])))
+        yield _following(name, *max(correlations, key=lambda following: np.max(following[1])))
 
 
 def _following(name: str, measurement: str, curve: np.ndarray, against: float) -> Row:

@@ -131,9 +131,9 @@ class MuonAdam(torch.optim.Adam):
 
     def load_state_dict(self, state_dict: dict) -> None:
         """Take up a state of :meth:`state_dict`."""
-        rest = dict(state_dict)
-        self._muon.load_state_dict(rest.pop("muon"))
-        super().load_state_dict(rest)
+        entries = dict(state_dict)
+        self._muon.load_state_dict(entries.pop("muon"))
+        super().load_state_dict(entries)
 
 
 def cosine_rate(
