@@ -11,7 +11,7 @@ from scipy.special import ellipk
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams, changed
-from tests.plants import EVERYTHING, paper_plant, plain_vehicle
+from tests.plants import EVERYTHING, calm, paper_plant
 from tests.simulators import bare_quadrotor, numerics, rods
 
 PERIOD = 1e-4
@@ -128,10 +128,14 @@ def test_hover_is_an_equilibrium():
 
 
 def test_external_wrench():
-    """Force over mass and torque over inertia, added to a vehicle in free fall."""
-    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
-    idle = replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
-    vehicle = replace(vehicle, controller=idle, queue=QueueParams(0.0))
+    """Force over mass and torque over inertia, added to a vehicle whose controller and air do
+    nothing.
+    """
+    vehicle = paper_plant().vehicle
+    none = (0.0, 0.0, 0.0)
+    gains = {"p_gain": none, "i_gain": none, "d_gain": none, "feedforward_gain": none}
+    idle = replace(vehicle.controller, min_thrust=0.0, **gains)
+    vehicle = replace(vehicle, controller=idle, aero=calm(vehicle.aero), queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
     sim.set_wrench([[0.3, -0.2, 0.1], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
     advance(sim, 10)
