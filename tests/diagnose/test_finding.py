@@ -17,7 +17,7 @@ SPOILT = {
     "always the most common name": lambda kinds, real: finding.always(most_common(kinds)),
     "reads file names": lambda kinds, real: finding.reader_of_file_names,
     "takes two effects for each other": lambda kinds, real: finding.exchanged(
-        kinds[0].hidden[0], other_than(kinds[0].hidden[0]), real
+        kinds[0].hidden[0], next(x for x in finding.SINGLE if x != kinds[0].hidden[0]), real
     ),
 }
 """What is wrong with a tool -> it, made for these kinds of worlds and from the real one."""
@@ -26,11 +26,6 @@ SPOILT = {
 def most_common(kinds) -> str:
     """The effect that most of these worlds hide."""
     return Counter(name for kind in kinds for name in kind.hidden).most_common(1)[0][0]
-
-
-def other_than(name: str) -> str:
-    """Return a single effect with another name."""
-    return next(other for other in finding.SINGLE if other != name)
 
 
 @fixture(scope="module")

@@ -51,6 +51,9 @@ def servos(*motors, hook=1900):
     return (*motors, 1000, 1000, 1000, 1000, hook, *[1000] * 7)
 
 
+GROUND = servos(1000, 1000, 1000, 1000)
+
+
 @fixture
 def bridge(monkeypatch):
     monkeypatch.setattr(ardupilot, "SERVOS", 0)  # any port that is free
@@ -83,7 +86,7 @@ def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
     """A frame that comes again moves nothing; time goes by the period; the vehicle stands until its
     rotors carry it.
     """
-    frames = [(n, servos(1000, 1000, 1000, 1000)) for n in (1, 2, 2, 3)]
+    frames = [(n, GROUND) for n in (1, 2, 2, 3)]
     states = fly(bridge, frames)
     assert [round(state["timestamp"], 6) for state in states] == [0.002, 0.004, 0.004, 0.006]
     assert (bridge.frames, bridge.repeated, bridge.restarts) == (3, 1, 0)
@@ -129,7 +132,7 @@ def test_time_goes_on_without_waiting_before_the_first_frame(bridge):
 
 
 def test_ardupilot_that_falls_silent_is_waited_for_once(bridge, monkeypatch):
-    fly(bridge, [(1, servos(1000, 1000, 1000, 1000))])
+    fly(bridge, [(1, GROUND)])
     monkeypatch.setattr(ardupilot, "PATIENCE", 0.01)
     bridge.step()
     assert not bridge.paced
@@ -145,7 +148,7 @@ def test_strange_packets_are_none():
 
 
 def test_ardupilot_that_starts_again_is_counted(bridge):
-    fly(bridge, [(50, servos(1000, 1000, 1000, 1000)), (1, servos(1000, 1000, 1000, 1000))])
+    fly(bridge, [(50, GROUND), (1, GROUND)])
     assert bridge.restarts == 1
 
 

@@ -67,6 +67,13 @@ class Desk:
             self.turn(0.02, HOVER, FOLLOW)
         raise AssertionError(self.status)
 
+    @property
+    def state(self):
+        return self.status.connected, self.status.mode
+
+    def release(self):
+        self.backend.release(self.now)
+
     def abort(self):
         """Ask for the end of the flight at each tick for a while."""
         for _ in range(20):
@@ -140,16 +147,16 @@ def test_hands(kind):
     if not desk.backend.holds:
         desk.fake.armed = False
         desk.turn(0.3, HOVER, FOLLOW)
-        assert (desk.status.connected, desk.status.mode) == (False, WAIT)
+        assert desk.state == (False, WAIT)
         assert desk.status.note == "disarmed"
         return
     desk.turn(0.3, HOVER, HOLD)
-    assert (desk.status.connected, desk.status.mode) == (True, HOLD)
+    assert desk.state == (True, HOLD)
     desk.turn(1.6, HOVER, FOLLOW)
-    assert (desk.status.connected, desk.status.mode) == (True, FOLLOW)
+    assert desk.state == (True, FOLLOW)
     desk.fake.mode, desk.fake._next_beat = (2 if kind == "ardupilot" else POSCTL), 0.0
     desk.turn(0.1, HOVER, FOLLOW)
-    assert (desk.status.connected, desk.status.mode) == (False, WAIT)
+    assert desk.state == (False, WAIT)
     assert "did not ask for: pilot or failsafe has it" in desk.status.note
     mode = desk.fake.mode
     desk.abort()
@@ -184,7 +191,7 @@ def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
 def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
     desk = Desk("px4")
     desk.turn(0.5)
-    assert (desk.status.connected, desk.status.mode) == (
+    assert desk.state == (
         True,
         HOLD,
     ), "in Position mode it may be taken"
@@ -224,7 +231,7 @@ def test_px4_left_without_a_stream_is_not_asked():
 def test_betaflight_waits_for_the_pilots_switch_and_refuses_one_that_is_on_too_early():
     desk = Desk("betaflight")
     desk.turn(0.5)
-    assert (desk.status.connected, desk.status.mode) == (True, WAIT)
+    assert desk.state == (True, WAIT)
     desk.fake.override = True
     desk.turn(0.2)
     assert desk.status.note.startswith("MSP OVERRIDE is on before the runner is ready")
@@ -416,7 +423,7 @@ def test_without_the_audit_the_traps_are_what_they_are():
     desk.turn(0.1, (7.0, 0.0, 0.0, 0.0))
     assert desk.fake.plant.commands[-1][0] == approx(2.668, rel=1e-3), "half thrust: no climb"
     desk = Desk("ardupilot", "ardupilot.audit=false", 'ardupilot.release="servo"').follow()
-    desk.backend.release(desk.now)
+    desk.release()
     desk.turn(0.7, HOVER)
     assert (desk.status.release, desk.fake.release_time) == ("failed", None)
     assert desk.backend.release_record.note == "accepted, but nothing moved within 0.5 s"
@@ -459,7 +466,7 @@ def test_betaflights_mechanism_closes_again(answer, after):
     """A while after it has opened, and where an unanswered release is stopped."""
     desk = Desk("betaflight", answer=answer).follow()
     channel = STICKS + desk.backend.params.release_channel - 1
-    desk.backend.release(desk.now)
+    desk.release()
     desk.turn(0.3, HOVER)
     assert desk.fake.channels[channel] > 1900
     if answer == "silent":
@@ -480,7 +487,7 @@ def test_a_release_that_is_stopped_before_its_hour_is_not_sent(kind):
 
 def test_px4_says_in_progress_first_and_that_is_pending():
     desk = Desk("px4").follow()
-    desk.backend.release(desk.now)
+    desk.release()
     desk.turn(0.5, HOVER)
     assert (desk.status.release, desk.fake.witness.releases) == ("pending", 1)
     desk.turn(0.8, HOVER)
@@ -588,11 +595,11 @@ def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():
     """MSP_SERVO does not show them; a good release is none that moved nothing."""
     desk = Desk("betaflight", parameters={"channel_forwarding": 1}).follow()
     assert desk.backend.voltage == approx(11.1), "sent in hundredths of a volt"
-    desk.backend.release(desk.now)
+    desk.release()
     desk.turn(1.0, HOVER)
     assert (desk.status.release, desk.fake.witness.releases) == ("accepted", 1)
     desk = Desk("betaflight", parameters={"channel_forwarding": 1}, answer="silent").follow()
-    desk.backend.release(desk.now)
+    desk.release()
     desk.turn(1.0, HOVER)
     assert desk.status.release == "failed", "a channel that does not arrive is none"
 

@@ -23,7 +23,7 @@ LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 PARAMS = CameraParams(
     LENS, MountParams(position_b=(0.03, 0.0, -0.02)), KeypointNoiseParams(), 0.25, 0.033
 )
-CENTRED = replace(PARAMS, mount=MountParams())
+CENTRED = KeypointCamera(replace(PARAMS, mount=MountParams()), dtype=torch.float64)
 EDGE = math.radians(110.0)
 
 
@@ -70,7 +70,6 @@ def test_rotation_vector_against_scipy():
 
 
 def test_extrinsic_error_moves_and_turns_the_camera():
-    camera = KeypointCamera(CENTRED, dtype=torch.float64)
     angle = 0.05
     rotation_error = f64([[0.0, -angle, 0.0], [0.0, 0.0, 0.0]])
     position_error = f64([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
@@ -78,7 +77,12 @@ def test_extrinsic_error_moves_and_turns_the_camera():
     payload_w = f64([[0.0, 0.0, 1.0]]).expand(2, 3)
     goal_w = torch.zeros(2, 2, dtype=torch.float64)
     points, _ = keypoints(
-        camera, pos_w, rot_wb, goal_w, payload_w, camera.extrinsics(rotation_error, position_error)
+        CENTRED,
+        pos_w,
+        rot_wb,
+        goal_w,
+        payload_w,
+        CENTRED.extrinsics(rotation_error, position_error),
     )
     middle = points[:, 4:].mean(1)
     # Camera pitched to the front by 0.05 rad: the ball below lies 0.05 rad towards the image's
@@ -88,10 +92,9 @@ def test_extrinsic_error_moves_and_turns_the_camera():
 
 
 def test_goal_below_a_level_vehicle_closed_form():
-    camera = KeypointCamera(CENTRED, dtype=torch.float64)
     pos_w, rot_wb = hover(1.0)
     points, valid = keypoints(
-        camera,
+        CENTRED,
         pos_w,
         rot_wb,
         torch.zeros(1, 2, dtype=torch.float64),
@@ -134,20 +137,18 @@ def test_payload_box_against_the_dense_outline(distance, tolerance):
 
 
 def test_the_payloads_box_is_smooth():
-    camera = KeypointCamera(CENTRED, dtype=torch.float64)
     ball_c = f64([[0.1, 0.2, 0.3], [0.3, -0.1, -0.05]]).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: payload_keypoints(camera, p)[0], (ball_c,))
+    assert torch.autograd.gradcheck(lambda p: payload_keypoints(CENTRED, p)[0], (ball_c,))
 
 
 def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
     # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front:
     # 102 deg off the axis.
-    camera = KeypointCamera(CENTRED, dtype=torch.float64)
     pos_w, _ = hover(1.0)
     rot_wb = rotation_from_vector(f64([[0.0, math.radians(40.0), 0.0]]))
     goal_w = f64([[math.tan(math.radians(62.0)), 0.0]])
     above_w = f64([[0.0, 0.0, 2.0]])
-    points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
+    points, valid = keypoints(CENTRED, pos_w, rot_wb, goal_w, above_w)
     assert valid[0, :4].all()
     assert not valid[0, 4:].any()
     # 102 deg of 110 towards the image's top; the square's corners lie about it.

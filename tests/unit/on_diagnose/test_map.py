@@ -36,6 +36,10 @@ FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b
 """Channels whose order or kind the proposal asks about, or that it leaves out."""
 
 
+def units_of(proposal) -> dict[str, str]:
+    return {c.name: c.unit for c in proposal.mapping.channels}
+
+
 @pytest.mark.parametrize("path", SETS)
 def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_path):
     """Columns and units of every channel that both have are the same, and the file loads."""
@@ -224,14 +228,14 @@ def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_abo
     """
     for units in (("cm", "deg"), ("m", "rad")):
         found = propose(unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv")
-        made = {c.name: c.unit for c in found.mapping.channels}
+        made = units_of(found)
         asked = "".join(found.questions)
         assert made == {"pos_w": units[0], "quat_wb": units[1]} or "with deg would do" in asked
 
 
 def test_angles_that_would_turn_a_flight_over_are_in_degrees():
     found = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
-    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "mm", "quat_wb": "deg"}
+    assert units_of(found) == {"pos_w": "mm", "quat_wb": "deg"}
     assert "deg, axes x,y,z by gravity" in found.why["quat_wb"]
     assert not found.questions
 
@@ -286,7 +290,7 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     grams = table_of(file)
     grams["ctrlLee.thrustSI"] = grams["ctrlLee.thrustSI"] / UNITS["gf"][1]
     found = propose(grams, file.name, mass=0.0369)
-    assert {c.name: c.unit for c in found.mapping.channels}["thrust_command"] == "gf"
+    assert units_of(found)["thrust_command"] == "gf"
     assert found.flyer["thrust_map"] == [0.0, 1.0, 0.0]
     both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
     assert any(

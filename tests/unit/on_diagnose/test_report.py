@@ -280,11 +280,6 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
-def texts_of(diagnosis):
-    """What a report's page says, as Markdown."""
-    return page.markdown_of("", "", report.sections(diagnosis))
-
-
 def test_terms_that_act_together_are_printed_together(found):
     """A drag is the first explanation here by a pair; the second is one term alone."""
     first = result.Law(
@@ -296,7 +291,7 @@ def test_terms_that_act_together_are_printed_together(found):
     unknown = replace(
         found[1], overall=result.UNKNOWN, laws=(first, second, alone), explanations=both
     )
-    text = texts_of(unknown)
+    text = page.markdown_of("", "", report.sections(unknown))
     (line,) = (line for line in text.splitlines() if "**Law.**" in line)
     assert "v_xy² v with c = 0.004" in line
     assert "|v| v_xy v with c = -0.008" in line

@@ -3,6 +3,7 @@ is asked for.
 """
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -59,16 +60,17 @@ def random_knots() -> dict:
     rng = default_rng(0)
     unit = lambda v: v / norm(v, axis=1, keepdims=True)  # noqa: E731
     k = 6
+    draw = partial(rng.normal, size=(k, 3))
     return {
         "time": np.arange(k) * 0.1,
-        "pos_w": rng.normal(size=(k, 3)) + [0, 0, 3],
-        "vel_w": rng.normal(size=(k, 3)),
+        "pos_w": draw() + [0, 0, 3],
+        "vel_w": draw(),
         "quat_wb": unit(rng.normal(size=(k, 4))),
-        "rate_b": rng.normal(size=(k, 3)),
+        "rate_b": draw(),
         "thrust": rng.uniform(1, 4, k),
-        "payload_pos_w": rng.normal(size=(k, 3)),
-        "payload_vel_w": rng.normal(size=(k, 3)),
-        "cable_dir_w": unit(rng.normal(size=(k, 3))),
+        "payload_pos_w": draw(),
+        "payload_vel_w": draw(),
+        "cable_dir_w": unit(draw()),
         "tension": rng.uniform(0, 1, k),
         "mount_b": np.tile([0.01, 0.0, -0.02], (k, 1)),
     }

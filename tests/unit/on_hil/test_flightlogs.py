@@ -201,7 +201,7 @@ def test_the_recording_of_a_run_holds_all(run, tmp_path):
     view.write(run[0], tmp_path / "run.rrd")
     data = (tmp_path / "run.rrd").read_bytes()
     assert data[:4] == b"RRF2"
-    entities = stored_entities(tmp_path / "run.rrd")
+    entities = run_python("-m", "rerun", "rrd", "print", tmp_path / "run.rrd", check=True).stdout
     for entity in (
         "/world/vehicle",
         "/world/ball",
@@ -230,11 +230,6 @@ def test_the_same_run_as_mcap(run, tmp_path, capsys, monkeypatch):
     flown = {channel.topic: counts[number] for number, channel in summary.channels.items()}
     assert flown["/vehicle"] > 100
     assert {"/camera/keypoints", "/events"} <= set(flown)
-
-
-def stored_entities(path) -> str:
-    """What rerun itself lists of a recording."""
-    return run_python("-m", "rerun", "rrd", "print", path, check=True).stdout
 
 
 class Stream:

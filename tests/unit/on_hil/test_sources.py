@@ -35,6 +35,10 @@ def odometry(frame=mav.MAV_FRAME_LOCAL_FRD, quality=0):
     return mav.MAVLink_odometry_message(7, frame, 12, 1.0, 2.0, 3.0, quat, *rest)
 
 
+def local_position(time_ms=1000):
+    return mav.MAVLink_local_position_ned_message(time_ms, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+
+
 def test_bodies_are_told_apart_by_their_senders():
     decoder = MavlinkDecoder(BODIES)
     assert decoder.feed(wired(mocap(), 1, 9), 0.0).body == "vehicle"
@@ -46,7 +50,7 @@ def test_bodies_are_told_apart_by_their_senders():
 
 def test_a_local_position_takes_the_attitude_of_its_sender():
     decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
-    local = wired(mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
+    local = wired(local_position())
     assert decoder.feed(local, 0.0) is None, "no attitude yet"
     attitude = mav.MAVLink_attitude_quaternion_message(990, 1.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75)
     decoder.feed(wired(attitude, 3, 1), 0.0)
@@ -62,8 +66,7 @@ def test_a_local_position_takes_the_attitude_of_its_sender():
         (4.0, 5.0, 6.0),
         (0.25, 0.5, 0.75),
     )
-    late = wired(mav.MAVLink_local_position_ned_message(1100, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0))
-    assert decoder.feed(late, 0.0) is None, "too old an attitude"
+    assert decoder.feed(wired(local_position(1100)), 0.0) is None, "too old an attitude"
 
 
 def test_a_local_position_takes_angles_as_well():
@@ -72,8 +75,7 @@ def test_a_local_position_takes_angles_as_well():
     decoder.feed(
         wired(mav.MAVLink_attitude_message(990, 0.0, 0.0, math.pi / 2, 0.1, 0.2, 0.3)), 0.0
     )
-    local = mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    pose = decoder.feed(wired(local), 0.5)
+    pose = decoder.feed(wired(local_position()), 0.5)
     assert pose.quat == approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
     assert pose.rate == approx((0.1, 0.2, 0.3))
 
@@ -93,7 +95,7 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
     )
     packed = [
         (odometry(mav.MAV_FRAME_LOCAL_FLU), 1),
-        (mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 25),
+        (local_position(), 25),
     ]
     if live:
         here, there = pipe()
