@@ -15,13 +15,15 @@ MOST_WORDS = 15_000
 """Of README and site together."""
 COMMENTS = r"<!--.*?-->"
 
+EACH = mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+
 
 @fixture(scope="module")
 def runner(tmp_path_factory):
     return Runner(tmp_path_factory.mktemp("pages"))
 
 
-@mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@EACH
 def test_blocks_run(runner, page):
     if blocks := blocks_of(page):
         runner.run(blocks)
@@ -49,7 +51,7 @@ def mean_words(text: str) -> float:
     return sum(len(part.split()) for part in found) / len(found) if found else 0.0
 
 
-@mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@EACH
 def test_sentences_are_short(page):
     assert mean_words(page.read_text(encoding="utf-8")) < MEAN_WORDS
 

@@ -165,12 +165,12 @@ def test_the_critic_learns_alone_while_the_actor_is_held():
 
 def test_a_rollout_keeps_the_memory_that_a_captured_update_reads():
     alg = build(params(), own=True)
-    iterate(alg, 0)
-    kept = alg.storage
-    places = [t.data_ptr() for t in (kept.advantages, kept.returns, kept.distribution_params[0])]
-    iterate(alg, 1)
-    again = [t.data_ptr() for t in (kept.advantages, kept.returns, kept.distribution_params[0])]
-    assert places == again
+    kept, places = alg.storage, []
+    for count in (0, 1):
+        iterate(alg, count)
+        tensors = (kept.advantages, kept.returns, kept.distribution_params[0])
+        places.append([t.data_ptr() for t in tensors])
+    assert places[0] == places[1]
 
 
 def test_a_state_that_was_saved_goes_on_the_same():

@@ -36,6 +36,12 @@ FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b
 """Channels whose order or kind the proposal asks about, or that it leaves out."""
 
 
+def hanging(time: np.ndarray) -> np.ndarray:
+    """Where a payload swings below its vehicle [m]."""
+    swing = 0.2 * np.sin(3.0 * time)
+    return 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
+
+
 def units_of(proposal) -> dict[str, str]:
     return {c.name: c.unit for c in proposal.mapping.channels}
 
@@ -117,8 +123,7 @@ def test_a_payload_belongs_to_the_path_that_it_hangs_below():
     """The first of three paths is another vehicle's."""
     time = np.arange(0.0, 20.0, 0.01)
     path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 2.0 + 0.2 * np.sin(time)])
-    swing = 0.2 * np.sin(3.0 * time)
-    below = 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
+    below = hanging(time)
     columns = {"time": time} | named("pos_a", 0.7 * path[::-1] + 1.0)
     columns |= named("pos_b", path) | named("pos_c", path + below)
     made = {entry.name: entry.columns[0] for entry in propose(columns, "a").mapping.channels}
@@ -137,8 +142,7 @@ def test_a_payload_belongs_to_the_path_that_it_hangs_below():
 def test_a_column_is_found_under_another_laboratorys_name(thrust, load, angles, rates, acc):
     columns = flight(20.0)
     lean = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX", degrees=True)[:, ::-1]
-    swing = 0.2 * np.sin(3.0 * columns["time"])
-    below = 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
+    below = hanging(columns["time"])
     table = {"utc_ms": 1.7e12 + 1e3 * columns["time"], thrust: columns["command"][:, 0]}
     table |= {f"p{a}": c for a, c in zip("xyz", 1e3 * columns["pos_w"].T)}
     body = np.degrees(columns["rate_b"]), columns["acc_b"]

@@ -42,69 +42,69 @@ def swing_log(length, viscous, coulomb, quadratic, offset) -> FlightLog:
     return log_at(time, angle=angle + offset + default_rng(1).normal(0, 2e-4, len(time)))
 
 
-class TestPendulum:
-    def test_frictions_are_told_apart(self):
-        log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
-        truth = {
-            "pendulum_length": 0.01,
-            "viscous_friction": 0.05,
-            "coulomb_friction": 0.1,
-            "quadratic_drag": 0.02,
-            "encoder_offset": 0.01,
-        }
-        estimates = found(PendulumModel([log], SWING), [*truth])
-        assert all(near(estimates, name, size) for name, size in truth.items()), estimates
-        assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
+def test_frictions_are_told_apart():
+    log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
+    truth = {
+        "pendulum_length": 0.01,
+        "viscous_friction": 0.05,
+        "coulomb_friction": 0.1,
+        "quadratic_drag": 0.02,
+        "encoder_offset": 0.01,
+    }
+    estimates = found(PendulumModel([log], SWING), [*truth])
+    assert all(near(estimates, name, size) for name, size in truth.items()), estimates
+    assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
 
 
-class TestGimbal:
-    PARAMS = GimbalParams(
-        (0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0
-    )
+GIMBAL = GimbalParams(
+    (0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0
+)
 
-    def logs(self, tilt, focal, delay) -> list[FlightLog]:
-        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
-        of scipy's.
-        """
-        rng = default_rng(2)
-        time = np.arange(0, 20, 1 / 30)
 
-        def seen(t):
-            turn = Rotation.from_euler(
-                "ZYX",
-                np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
-            )
-            gap = np.column_stack(
-                [0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)]
-            )
-            gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
-            local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
-            return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
+def gimbal_logs(tilt, focal, delay) -> list[FlightLog]:
+    """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
+    of scipy's.
+    """
+    rng = default_rng(2)
+    time = np.arange(0, 20, 1 / 30)
 
-        turn, gap, _ = seen(time)
-        point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
-        gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
-        log = log_at(
-            time,
-            pos_w=np.tile([0, 0, 4.0], (len(time), 1)),
-            quat_wb=turn.as_quat(),
-            payload_pos_w=gap + [0, 0, 4],
-            marker_pos_c=point + rng.normal(0, 0.005, point.shape),
-            gimbal=gimbal,
+    def seen(t):
+        turn = Rotation.from_euler(
+            "ZYX",
+            np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
         )
-        return [log]
+        gap = np.column_stack(
+            [0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)]
+        )
+        gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
+        local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
+        return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
 
-    def test_tilt_delay_and_focal_length_are_found(self):
-        model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)
-        truth = {
-            "camera_tilt_x": 0.02,
-            "camera_tilt_y": -0.015,
-            "camera_tilt_z": 0.01,
-            "camera_delay": 0.06,
-            "focal_scale": -0.03,
-        }
-        estimates = found(model, [*truth])
-        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items())
+    turn, gap, _ = seen(time)
+    point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
+    gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
+    log = log_at(
+        time,
+        pos_w=np.tile([0, 0, 4.0], (len(time), 1)),
+        quat_wb=turn.as_quat(),
+        payload_pos_w=gap + [0, 0, 4],
+        marker_pos_c=point + rng.normal(0, 0.005, point.shape),
+        gimbal=gimbal,
+    )
+    return [log]
+
+
+def test_tilt_delay_and_focal_length_are_found():
+    model = GimbalModel(gimbal_logs((0.02, -0.015, 0.01), 0.97, 0.06), GIMBAL)
+    truth = {
+        "camera_tilt_x": 0.02,
+        "camera_tilt_y": -0.015,
+        "camera_tilt_z": 0.01,
+        "camera_delay": 0.06,
+        "focal_scale": -0.03,
+    }
+    estimates = found(model, [*truth])
+    assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items())
 
 
 SWUNG = REAL / "pendulum_single" / "single_pendulum_id.csv.gz"

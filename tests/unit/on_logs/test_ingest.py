@@ -51,6 +51,9 @@ def packed(text: str) -> bytes:
     return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
 
 
+TWO_BITS = packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2))
+
+
 class TestCodec:
     """Each packing, written by the test from the format's description."""
 
@@ -81,7 +84,7 @@ class TestCodec:
     @mark.parametrize(
         ("code", "data", "values"),
         [
-            ("3S32", packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            ("3S32", TWO_BITS, [1, -2, -1]),
             ("3S32", packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
             (
                 "3S32",
@@ -93,7 +96,7 @@ class TestCodec:
                 bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)),
                 [-5, -300, -(2**31)],
             ),
-            ("3SVARIABLE", packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
+            ("3SVARIABLE", TWO_BITS, [1, -2, -1]),
             ("3SVARIABLE", packed("01" + bits(15, 5) + bits(-16, 5) + bits(-8, 4)), [15, -16, -8]),
             (
                 "3SVARIABLE",
