@@ -155,10 +155,10 @@ CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(
 )
 HOLD = ("--set", "states.check_hold=2.0")
 MAPPING = """
-base = "{base}"
+base = "hil/dry_run.toml"
 [source]
 kind = "csv"
-file = "{file}"
+file = "poses.csv"
 senders = []
 [source.time]
 column = "t"
@@ -192,7 +192,7 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused, printe
     """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "poses.csv").write_text(CSV)
-    (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
+    (tmp_path / "mine.toml").write_text(MAPPING)
     assert run_command("hil run --config mine.toml --out run") == 0
     text = capsys.readouterr()
     assert "vehicle: 300 poses taken; refused: none" in text.out
@@ -224,7 +224,7 @@ def test_a_run_whose_poses_cease_in_flight_is_packed_and_fails(tmp_path, monkeyp
     monkeypatch.chdir(tmp_path)
     rows = CSV.splitlines(keepends=True)
     (tmp_path / "poses.csv").write_text("".join([*rows[:220], rows[-1]]))
-    (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
+    (tmp_path / "mine.toml").write_text(MAPPING)
     command = ["hil", "run", "--config", "mine.toml", "--set", "observe=false", "--out", "run"]
     assert main(command) == 1
     assert "run.zip  the run in one file" in capsys.readouterr().out
