@@ -10,7 +10,7 @@ cases whose names hold it. Three tables:
 - traps: flights that somebody spoilt. What is said must name what was done, or refuse with that
   reason.
 - parts: flights of one vehicle by themselves. What one of two names must be within the other's
-  interval, both taken together.
+  interval, both taken together with what either says that another flight may differ by.
 """
 
 import argparse
@@ -32,6 +32,7 @@ from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
 from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import setup as setups
+from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.reporting.gain import on_others
@@ -317,7 +318,7 @@ def _spoilt(name: str, change: Callable[[Logs], Logs], expect: str) -> Case:
     return Case(f"trap {name}", "cf_payload", CF3, change, expect=expect)
 
 
-LATER = r"clocks apart|stream of the thrust|ms (late|early)"
+LATER = r"clocks apart|stream of the thrust|ms (late|early|behind)"
 TRAPS = (
     _spoilt(
         "x and y of positions exchanged",
@@ -499,7 +500,7 @@ def run(task: tuple[Case, Path]) -> dict:
             "varies": [s.name for s in diagnosis.scatter if s.found],
             "gain": {c.channel: [c.before, c.after, c.floor, c.gain, c.low, c.high] for c in held},
             "sizes": {
-                f.name: [f.estimate, f.low, f.high, f.verdict]
+                f.name: [f.estimate, f.low, f.high, f.verdict, f.differs]
                 for f in diagnosis.findings
                 if f.high > f.low and case.of
             },
@@ -558,9 +559,13 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
 
 
 def _one_size(a: Sequence, b: Sequence) -> bool:
-    apart = abs(a[1] + a[2] - b[1] - b[2])
-    width = float(np.hypot(a[2] - a[1], b[2] - b[1]))
-    return apart <= width
+    """Whether two findings may be of one size: within their intervals, and what either says that
+    another flight may differ by.
+    """
+    apart = abs(a[1] + a[2] - b[1] - b[2]) / 2.0
+    half_widths = [(f[2] - f[1]) / 2.0 for f in (a, b)]
+    half_widths += [NORMAL_95 * f[4] for f in (a, b)]
+    return apart <= float(np.linalg.norm(half_widths))
 
 
 def table(rows: Sequence[dict]) -> str:

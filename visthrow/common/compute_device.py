@@ -8,17 +8,28 @@ from visthrow.common.errors import DeviceError
 
 def resolve(name: str = "auto") -> str:
     """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu``
-    or ``cuda:<i>``, a device that both Warp and torch can use.
+    or ``cuda:<i>``, a device that torch can use.
 
     Raises DeviceError if there is no such device.
     """
+    import torch
+
+    return _chosen(name, torch.cuda.device_count() if torch.cuda.is_available() else 0)
+
+
+def resolve_for_warp(name: str = "auto") -> str:
+    """Return :func:`resolve` of what simulates alone: it need not load torch, which takes seconds.
+
+    Raises DeviceError if Warp has no such device."""
     import warp as wp
 
-    count = wp.get_cuda_device_count()
-    if count:  # torch takes seconds to load, and has nothing to say without a GPU
-        import torch
+    from camera.warp_start import start
 
-        count = torch.cuda.device_count()
+    start()
+    return _chosen(name, wp.get_cuda_device_count())
+
+
+def _chosen(name: str, count: int) -> str:
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
     device = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
     if device not in exists:

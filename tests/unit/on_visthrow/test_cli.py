@@ -228,11 +228,12 @@ def test_a_file_of_windows_notepad_is_read(tmp_path):
     assert config.load(VehicleParams, path).body.mass == 0.21
 
 
-def test_devices_that_do_not_exist_are_refused():
-    assert compute_device.resolve("cpu") == "cpu"
-    assert compute_device.resolve("auto") in ("cpu", "cuda:0")
+@mark.parametrize("resolve", [compute_device.resolve, compute_device.resolve_for_warp])
+def test_devices_that_do_not_exist_are_refused(resolve):
+    assert resolve("cpu") == "cpu"
+    assert resolve("auto") in ("cpu", "cuda:0")
     with raises(DeviceError, match=r"no device 'cuda:99'; expected auto or one of cpu"):
-        compute_device.resolve("cuda:99")
+        resolve("cuda:99")
 
 
 def test_suggestions():

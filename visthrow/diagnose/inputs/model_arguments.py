@@ -137,7 +137,7 @@ def throw_model(
     """The whole throw, with the plant of an experiment, and its logs with their
     commands put right.
     """
-    from visthrow.common.compute_device import resolve
+    from visthrow.common.compute_device import resolve_for_warp
     from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -149,7 +149,7 @@ def throw_model(
     measured = {
         "sensing": experiment.sensing,
         "camera": experiment.camera,
-        "device": resolve(args.device),
+        "device": resolve_for_warp(args.device),
     }
     measured |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)

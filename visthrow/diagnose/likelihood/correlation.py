@@ -180,34 +180,35 @@ def _likeliest(
     channel: int,
     scale: float,
 ) -> tuple[Correlation, float]:
-    """The likeliest correlation of a channel beside those known, and its nats above white noise."""
+    """The correlation of a channel beside those known, and its nats above white noise.
+
+    Time and share trade off along a ridge: of those that are hardly less likely than the best, the
+    one of the shortest time."""
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
     period = float(np.median(np.concatenate(steps)))
     white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
     if period > LONGEST:
         return white[0], 0.0
     none = max(_likelihood(windows, channels, correlations_of, channel, w)[0] for w in white)
-    best = -np.inf, white[0]
-    longer = -np.inf
+    tried: list[tuple[float, Correlation]] = []
     levels: noise.Noise | None = None
 
     def shortfall(place: ndarray, order: int) -> float:
-        nonlocal best, longer, levels
+        nonlocal levels
         guess = Correlation(period * np.exp(place[0]), float(expit(place[1])), order, scale)
         value, levels = _likelihood(windows, channels, correlations_of, channel, guess, levels)
-        if guess.time > LONGEST:
-            longer = max(longer, value)
-        elif value > best[0]:
-            best = value, replace(guess, scale=scale * levels.scale[channel])
+        tried.append((value, replace(guess, scale=scale * levels.scale[channel])))
         return -value
 
     bounds = [(0.0, np.log(2.0 * LONGEST / period)), logit(SHARES)]
     order = min((1, 2), key=lambda order: shortfall(START[0], order))
     options = {"initial_simplex": START, "xatol": np.inf, "fatol": noise.ENOUGH_NATS}
     minimize(shortfall, START[0], (order,), "Nelder-Mead", bounds=bounds, options=options)
-    value, likeliest = best
-    lasts = longer > value + STRONG
-    return likeliest, 0.0 if lasts else value - none
+    best = max(value for value, _ in tried)
+    near = [guess for value, guess in tried if value > best - STRONG and guess.time <= LONGEST]
+    if not near:
+        return white[0], 0.0
+    return min(near, key=lambda guess: guess.time), best - none
 
 
 def _likelihood(

@@ -18,7 +18,7 @@ def run(args: argparse.Namespace) -> int:
     """Fly each manoeuvre once, and write a log of each, or none if one of them is refused.
 
     Raises DiagnoseError: a manoeuvre that does not exist, or that this vehicle cannot fly."""
-    from visthrow.common.compute_device import resolve
+    from visthrow.common.compute_device import resolve_for_warp
     from visthrow.common.storage import writable
     from visthrow.diagnose.planning import manoeuvres
     from visthrow.diagnose.planning.fly_manoeuvres import fly
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     plant = plant_of(load_experiment(args.plant, args.overrides))
     folder = Path(args.out)
     writable(folder)
-    flights = fly(plant, chosen, args.seed, resolve(args.device))
+    flights = fly(plant, chosen, args.seed, resolve_for_warp(args.device))
     for flight in flights:
         if flight.used >= 1.0:
             raise DiagnoseError(
