@@ -14,7 +14,7 @@ from pathlib import Path
 from bench import start
 from bench.report import Report, Table, add_arguments_of_measurements, finish
 from sim.cores import cores
-from visthrow.common.compute_device import resolve
+from visthrow.common.compute_device import resolve_for_warp
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.reporting import explain_cli
 from visthrow.diagnose.select import diagnose_flights
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print, keep."""
     runs = [measure(args) for _ in range(args.repeats)]
     stages = [stage for stage in ("open", "explain", "verdict", "report") if stage in runs[0]]
-    bar = VERDICT_S["cuda" if resolve(args.device).startswith("cuda") else "cpu"]
+    bar = VERDICT_S["cuda" if resolve_for_warp(args.device).startswith("cuda") else "cpu"]
     bars = {"verdict": f"{bar:g}", "report": f"{REPORT_S:g}"}
     rows = tuple(
         (stage, *(f"{found[stage]:.1f}" for found in runs), bars.get(stage, "")) for stage in stages
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     )
     notes = (
         (
-            f"Device {resolve(args.device)}, {cores()} CPU cores. Wall time without Python's start;"
+            f"Device {resolve_for_warp(args.device)}, {cores()} CPU cores. Wall time without Python's start;"
             " a first run may compile kernels."
         ),
         (

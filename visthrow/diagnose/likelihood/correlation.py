@@ -6,12 +6,12 @@ first or second order (Matern 1/2 and 3/2):
 
     c(t) = (1 - w) [t = 0] + w k(t / tau),   k_1(x) = exp(-x),   k_2(x) = (1 + x) exp(-x)
 
-Every window gets the Cholesky factors of these correlations at its own stamps; the inner products
-of :mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so that evidence,
-thresholds and intervals know of them. Noise of samples that neighbour each other says nothing about
-the noise at low frequencies, where causes lie: time, share and order are the likeliest of whole
-windows, with initial states, latent forces and every effect integrated out, so that no cause is
-taken for noise.
+Every window gets the Cholesky factors of these correlations at its stamps. The inner products of
+:mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so evidence, thresholds
+and intervals account for the correlations. Neighbouring samples say nothing about the noise at low
+frequencies, where causes lie. So time, share and order are chosen by the likelihood of whole
+windows, with initial states, latent forces and every effect integrated out: no cause passes for
+noise.
 
 Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal likelihood).
 """
@@ -35,25 +35,26 @@ from visthrow.diagnose.models.model_interface import Window
 T = TypeVar("T")
 
 SUSPECT = 0.1
-"""Correlation of neighbouring samples from which a channel is looked at: of ten thousand white ones
-it has a deviation of 0.01.
+"""Correlation of neighbouring samples above which a channel is examined. Of ten thousand white
+samples it has a deviation of 0.01.
 """
 
 LONGEST = 0.15
-"""Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something
-that the model lacks.
+"""Longest correlation time [s]. A residual that lasts longer is not a sensor's noise: the model
+lacks something.
 """
 
 SHARES = 0.5, 0.999
-"""Limits of the correlated part of the variance; the rest keeps the correlations' inverse within
-what doubles hold.
+"""Limits of the correlated share of the variance. The white rest keeps the inverse of the
+correlations finite in double precision.
 """
 
 START = np.array([[1.4, 3.0], [2.5, 3.0], [1.4, 5.0]])
-"""Where the search begins: logarithm of the time in the samples' periods, and of the share's odds.
+"""Simplex at which the search begins: logarithm of the time in sampling periods, and of the
+share's odds.
 """
 
-# windows that the estimate is made of, and that tell whether a question is worth asking all
+# windows that the estimate uses; also a sample of windows, before all of them are examined
 LOOKED_AT = 8
 
 
@@ -92,9 +93,9 @@ def components(window: Window, channel: int) -> ndarray | None:
 def with_correlations(
     windows: Sequence[Window], correlations_of: Mapping[int, Correlation]
 ) -> list[Window]:
-    """Tell windows of the correlations of their channels' noise; ``windows``: of white noise;
-    ``correlations_of``: of channels, by number.
-    """
+    """Give windows the correlations of their channels' noise.
+
+    ``windows``: with white noise; ``correlations_of``: of channels, by number."""
     if not correlations_of:
         return list(windows)
     return parallel_map(partial(_with_correlation, correlations_of=correlations_of), windows)
@@ -153,8 +154,8 @@ def _with_free_effects(window: Window, slabs: ndarray) -> Window:
 def _suspected(
     windows: Sequence[Window], residuals: Sequence[ndarray], channel: int
 ) -> float | None:
-    """Deviation of what is left of a channel, in that which is stated; None where its neighbours
-    are hardly correlated.
+    """Return the deviation of a channel's residual as a multiple of the stated one; None where
+    neighbouring samples are hardly correlated.
     """
     parts = []
     for window, residual in zip(windows, residuals):
@@ -180,10 +181,10 @@ def _likeliest(
     channel: int,
     scale: float,
 ) -> tuple[Correlation, float]:
-    """The correlation of a channel beside those known, and its nats above white noise.
+    """Return the correlation of a channel beside those known, and its nats above white noise.
 
-    Time and share trade off along a ridge: of those that are hardly less likely than the best, the
-    one of the shortest time."""
+    Time and share trade off along a ridge. Of the guesses that are nearly as likely as the best,
+    it is the one with the shortest time."""
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
     period = float(np.median(np.concatenate(steps)))
     white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
@@ -219,8 +220,8 @@ def _likelihood(
     guess: Correlation,
     start: noise.Noise | None = None,
 ) -> tuple[float, noise.Noise]:
-    """Log marginal likelihood of windows with a guess of a channel's correlation, and their levels;
-    ``start``: where these are searched from.
+    """Return the log marginal likelihood of windows with a guess of a channel's correlation, and
+    their noise levels; ``start``: where the search for these begins.
     """
     correlated = with_correlations(windows, {**correlations_of, channel: guess})
     grams = parallel_map(partial(hidden_gram, channels=channels), correlated)
