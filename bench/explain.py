@@ -58,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
     """Measure, print, keep."""
     runs = [measure(args) for _ in range(args.repeats)]
     stages = [stage for stage in ("open", "explain", "verdict", "report") if stage in runs[0]]
-    bar = VERDICT_S["cuda" if resolve_for_warp(args.device).startswith("cuda") else "cpu"]
+    device = resolve_for_warp(args.device)
+    bar = VERDICT_S["cuda" if device.startswith("cuda") else "cpu"]
     bars = {"verdict": f"{bar:g}", "report": f"{REPORT_S:g}"}
     rows = tuple(
         (stage, *(f"{found[stage]:.1f}" for found in runs), bars.get(stage, "")) for stage in stages
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     )
     notes = (
         (
-            f"Device {resolve_for_warp(args.device)}, {cores()} CPU cores. Wall time without Python's start;"
+            f"Device {device}, {cores()} CPU cores. Wall time without Python's start;"
             " a first run may compile kernels."
         ),
         (
