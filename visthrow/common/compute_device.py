@@ -18,9 +18,10 @@ def resolve(name: str = "auto") -> str:
 
 
 def resolve_for_warp(name: str = "auto") -> str:
-    """Return :func:`resolve` of what simulates alone: it need not load torch, which takes seconds.
+    """Resolve a name as :func:`resolve` does, to a device that Warp can use.
 
-    Raises DeviceError if Warp has no such device."""
+    For what only simulates: it does not load torch, which takes seconds. Raises DeviceError if
+    there is no such device."""
     import warp as wp
 
     from camera.warp_start import start

@@ -201,15 +201,15 @@ class Recognition:
                 continue
             doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
             doubt += _TILTED * (physics.median_tilt(channel.samples().values) > physics.STEEPEST)
-            doubt += _TILTED * self._hangs_askew(channel, axes)
+            doubt += _TILTED * self._leans_by_accelerometers(channel, axes)
             words = [unit] * open_unit + [f"order {order}"] * open_order
             words.append(f"axes {axes or 'x,y,z'}")
             ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
         return ways
 
-    def _hangs_askew(self, attitude: Channel, axes: str) -> bool:
-        """Tell whether accelerometers say that an attitude, whose body has these axes, is wrong:
-        over a flight the mean force points up.
+    def _leans_by_accelerometers(self, attitude: Channel, axes: str) -> bool:
+        """Return whether an attitude, whose body has these axes, turns the mean force of every
+        accelerometer away from up, where it points over a flight.
         """
         attitudes = attitude.samples()
         groups = self._hinting("acc_b")

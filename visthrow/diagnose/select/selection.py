@@ -49,7 +49,7 @@ from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
 
 SHORTLIST = 12  # sets that promise most, which are simulated where they are near the best
-FIRST = 4  # sets that are simulated even if they promise less than the best by WINDOW
+FIRST = 4  # sets that are simulated although they promise less than the best, by up to WINDOW
 REPORTED_SETS = 10  # sets that a step keeps for the report
 
 

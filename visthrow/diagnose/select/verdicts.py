@@ -184,7 +184,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
-        # flights that were found to differ each for itself may leave nothing to vary
+        # single flights that were found to differ may leave nothing that varies among all
         found = not usual and verdict.size > verdict.floor
         verdicts.append(replace(verdict, found=found))
         if not usual:
@@ -515,7 +515,7 @@ def _explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
     unlike = sorted(c.name for c in selection.best.chosen if c.group == EVENT)
-    if len(unlike) > 1:  # a single flight's is an accident, beside which the model explains all
+    if len(unlike) > 1:  # one flight that differs is an accident: the model explains the others
         besides += unlike
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
