@@ -27,7 +27,7 @@ from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_mano
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.throw import cutting
+from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -364,6 +364,11 @@ def test_the_answer_counts_the_windows_that_are_left_out(monkeypatch):
     model = ThrowModel(logs, paper_plant(), only=["thrust_gain"])
     assert len(model.windows({})) == 2
     assert model.notes[0].startswith("2 of 6 windows are looked at")
+
+
+def test_a_path_comes_down_between_two_points():
+    path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
+    assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
 
 
 SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])

@@ -1,4 +1,4 @@
-"""The parameter audit: asked for until told, judged, written only where the operator said so, and
+"""The parameter audit: asked for until answered, judged, written only where the operator said so, and
 the release's book-keeping.
 """
 
@@ -72,6 +72,11 @@ def test_writing_keeps_other_bits_and_is_read_back():
 def test_what_cannot_be_written_stays_wrong():
     found, _, written, _, _ = audit({**GOOD, "FIXED": float("nan")}, write=True)
     assert (found.problems, written) == (["FIXED is nan; expected 7"], [])
+
+
+def test_a_timeout_of_zero_is_below_its_range():
+    found, *_ = audit({**GOOD, "GUID_TIMEOUT": 0.0})
+    assert found.problems == ["GUID_TIMEOUT is 0; expected above 0, at most 0.5"]
 
 
 def test_a_value_that_the_vehicle_does_not_take_is_written_once():
