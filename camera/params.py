@@ -11,7 +11,7 @@ import numpy as np
 
 from camera.field_bounds import Bound, BoundedFields, Length, NotNegative, Positive, Share
 
-SEEN_AT_LEAST = math.radians(1.0)
+SMALLEST_VIEW = math.radians(1.0)
 """Angle off the axis that any lens must image [rad]."""
 
 
@@ -65,9 +65,9 @@ class FisheyeParams(BoundedFields):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        t2 = SEEN_AT_LEAST**2
+        t2 = SMALLEST_VIEW**2
         bend = sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients))
-        slope = SEEN_AT_LEAST * (1 + bend)
+        slope = SMALLEST_VIEW * (1 + bend)
         if slope * min(self.fx, self.fy) > math.hypot(self.width, self.height):
             raise ValueError(
                 f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg"

@@ -133,7 +133,7 @@ def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
     return [
         f"{count} {entry.text()}"
         for roster in rosters
-        for entry, count in roster.seen.items()
+        for entry, count in roster.received.items()
         if entry.why and entry.system is not None and entry.address in (None, *roster.at.values())
         if count > seconds
     ]
@@ -161,10 +161,10 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
-    for entry, count in roster.seen.most_common():
+    for entry, count in roster.received.most_common():
         if silent or entry.why:
             lines.append(f"  {count / seconds:.1f} a second: {entry.text()}")
-    if silent and not roster.seen:
+    if silent and not roster.received:
         lines.append(f"  nobody speaks on {params.source.device or params.link.device}")
     return lines
 

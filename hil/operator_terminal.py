@@ -109,11 +109,11 @@ class Terminal:
         except (AttributeError, OSError, ValueError):  # there is no terminal
             self._file = -1
         for number in ENDING:
-            signal.signal(number, self._told_to_end)
+            signal.signal(number, self._handle_signal)
         for number in PAUSING:
             signal.signal(number, signal.SIG_IGN)
 
-    def _told_to_end(self, number: int, frame: Any) -> None:
+    def _handle_signal(self, number: int, frame: Any) -> None:
         if number == signal.SIGINT and self._why.endswith("(Ctrl-C)"):
             raise KeyboardInterrupt
         if not self._why or number == signal.SIGINT:

@@ -1,4 +1,4 @@
-"""Calibration files of the field, as our lens: which tool wrote a file is told from its keys.
+"""Calibration files of the field, as our lens: a file's keys say which tool wrote it.
 
 Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, OKVIS,
 vikit, ORB-SLAM, stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as ``topic
@@ -489,7 +489,7 @@ def _lens(
 def _fitted(
     model: str, values: Values, size: tuple[int, int], fov: float | None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Fit our lens; ocam's polynomial is told how far the image reaches."""
+    """Fit our lens; ocam's polynomial needs to know how far the image reaches."""
     core = model.partition("-")[0]
     if core == "ocam":
         x, y = values["cx"], values["cy"]

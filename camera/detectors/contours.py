@@ -218,11 +218,11 @@ class Detector:
         """
         best = None
         for _ in range(2):
-            points, seen = polar_edge(level, centre, radius)
+            points, coverage = polar_edge(level, centre, radius)
             if len(points) < 8:
                 return None
             ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, points))
-            score = seen * share
+            score = coverage * share
             if score < 0.5 * self.params.coverage or not half_angle > 0.0:
                 return None
             if score >= self.params.coverage:
@@ -264,7 +264,7 @@ class Detector:
 
     def _right_size(self, rays_c: ndarray, prior: Prior) -> bool:
         """Whether the corners lie on the ground, a goal's side from one another; true where that
-        cannot be told.
+        cannot be determined.
         """
         if prior.up_c is None or prior.height is None:
             return True

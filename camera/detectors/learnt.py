@@ -5,7 +5,7 @@ One network looks at the whole frame, halved, and names places: for each cell of
 ball (a square) has its middle there, where in the cell and how large. Two others look at those
 places, each in a patch that is rectified about its ray, so that no lens bends it: how sure, where
 and how large exactly, and to what accuracy. What comes out are rays. Confidences are calibrated on
-pictures that were not trained on, and told as probabilities."""
+pictures that were not trained on, and returned as probabilities."""
 
 import json
 import math
@@ -274,7 +274,7 @@ class LearntDetector(Detector):
 
     def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:
         expected = (prior.ball_ray_c, prior.ball_within)
-        probability = self._expected_there(probability, things[:, :3], *expected)
+        probability = self._raised_near(probability, things[:, :3], *expected)
         for i in probability.argsort(descending=True).tolist():
             ray = things[i, :3].double().numpy()
             half_angle = float(things[i, 3])
@@ -288,7 +288,7 @@ class LearntDetector(Detector):
         """
         middles = F.normalize(things.mean(1), dim=-1)
         expected = (prior.goal_ray_c, prior.goal_within)
-        raised = self._expected_there(probability, middles, *expected)
+        raised = self._raised_near(probability, middles, *expected)
         squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
@@ -297,7 +297,7 @@ class LearntDetector(Detector):
                 squares.append(GoalSeen(rays, float(probability[i])))
         return tuple(squares)
 
-    def _expected_there(
+    def _raised_near(
         self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, tolerance: float
     ) -> Tensor:
         """Probabilities where it is known about where the thing is; the networks' own are of a

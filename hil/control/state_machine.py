@@ -318,7 +318,7 @@ class TickRecord:
     release: bool = False  # the policy's release was executed
     note: str = ""
     waits: str = ""  # what the state waits for
-    ready: int = 0  # for what, as the team is told; see `hil.links.team_link`
+    ready: int = 0  # for what, as the team receives it; see `hil.links.team_link`
     agreed: int | None = None  # by the team for this tick; None without a team
     # in a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     detection: list | None = None

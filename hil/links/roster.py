@@ -27,7 +27,7 @@ Address = tuple[str, int] | None
 # after which another address may take a party's place on the ground: longer than a heartbeat's
 # second [s]
 SILENT = 1.5
-# kinds of messages of all senders that are told apart; the rest is counted together
+# kinds of messages of all senders that are counted apart; the rest is counted together
 MOST_KEPT = 256
 MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
 # why a message of a party is not taken that has not been heard as the one that it is to be
@@ -118,7 +118,7 @@ class Roster:
     Attributes:
         at: address by party. heard: when it last spoke [s]. flying: whether parties are held to
             their addresses.
-        seen: counts of what came. refused: messages and datagrams that were not taken.
+        received: counts of what came. refused: messages and datagrams that were not taken.
         moved: called with a party that came back from another address. tell: is handed each sender
             that is refused, once.
         simulated: whether a party has said that nothing real flies. only: address that the device
@@ -140,7 +140,7 @@ class Roster:
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
         self.flying = self.simulated = False
-        self.seen: Counter[Traffic] = Counter()
+        self.received: Counter[Traffic] = Counter()
         self.refused = 0
         self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
@@ -174,8 +174,10 @@ class Roster:
             self.tell(f"refused: {traffic.text()}")
 
     def _count(self, traffic: Traffic, count: int = 1) -> None:
-        traffic = traffic if traffic in self.seen or len(self.seen) < MOST_KEPT else OTHER_TRAFFIC
-        self.seen[traffic] += count
+        traffic = (
+            traffic if traffic in self.received or len(self.received) < MOST_KEPT else OTHER_TRAFFIC
+        )
+        self.received[traffic] += count
 
     def admit(self, message: Any, address: Address, host_time: float) -> bool:
         """Return whether a message is one of a party's; binds the party to its sender's address at
@@ -299,7 +301,7 @@ class Roster:
         """Return who was heard from where, and what was refused, most first."""
         refused = [
             {"count": count, "what": traffic.text()}
-            for traffic, count in self.seen.most_common()
+            for traffic, count in self.received.most_common()
             if traffic.why or traffic is OTHER_TRAFFIC
         ]
         return {

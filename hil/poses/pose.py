@@ -22,7 +22,7 @@ ZEROS = ([0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
 
 
 def has_attitude(quat: Quaternion | None) -> bool:
-    """Return whether an attitude is told: single markers have NaN or zeros there."""
+    """Return whether an attitude is known: single markers have NaN or zeros there."""
     return quat is not None and not any(map(math.isnan, quat)) and any(quat)
 
 

@@ -265,7 +265,7 @@ class Fake(ABC):
         return None
 
     def happened(self, text: str) -> None:
-        """Note something that the autopilot did by itself, or was told; what goes on from one
+        """Note something that the autopilot did by itself, or was commanded; what goes on from one
         period to the next is one event.
         """
         goes_on = self.plant.time - self._going_on.get(text, -1e9) < GOES_ON * self.plant.period

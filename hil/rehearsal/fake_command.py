@@ -135,7 +135,7 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
 
 
 def make_ball(policy: str, seed: int) -> HangingBall:
-    """Return the rope and ball that a policy was trained with, below a vehicle that is told where
+    """Return the rope and ball that a policy was trained with, below a vehicle that receives where
     it is.
     """
     contract = Policy.load(find_policy(policy)).contract

@@ -32,7 +32,7 @@ from sim.reference.rotation_arrays import cross, quat_dot, rotation_from_quat, t
 from sim.reference.snapshot import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
-OWN = slice(BODY, BODY + BLOCKS)  # columns of the blocks
+BLOCK_STATES = slice(BODY, BODY + BLOCKS)  # columns of the blocks
 FREE = slice(BODY + BLOCKS, BODY + BLOCKS + 6)  # and of a loose rope's upper end
 LARGEST_DECAY = 2.2
 """Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis.
@@ -287,10 +287,10 @@ class ReferencePlant:
         near_ground = vehicle_blocks.near_ground(
             self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
         )
-        force_b, torque_b, rates[:, OWN], thrust = vehicle_rates(
+        force_b, torque_b, rates[:, BLOCK_STATES], thrust = vehicle_rates(
             vehicle,
             self._errors,
-            state[:, OWN],
+            state[:, BLOCK_STATES],
             command,
             air_b,
             rate_b,
@@ -484,7 +484,7 @@ class ReferencePlant:
         """The true state now."""
         state = self._state
         rotation = rotation_from_quat(state[:, QUAT])
-        blocks = state[:, OWN]
+        blocks = state[:, BLOCK_STATES]
         offset = self._errors.com_offset
         points, ball, ball_vel = self._points(state)
         landed = self._landed[:, None]

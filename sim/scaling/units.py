@@ -66,7 +66,7 @@ def in_units(
 ) -> Value:
     """Dataclass of SI values with its numbers stated in other units, tables in it too.
 
-    Raises ValueError: a field whose dimension is not told, or a plant with laws, whose coefficients
+    Raises ValueError: a field without a dimension, or a plant with laws, whose coefficients
     have none of their own."""
     if isinstance(value, PlantParams) and value.laws:
         raise ValueError(

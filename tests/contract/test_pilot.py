@@ -88,7 +88,7 @@ def test_a_rehearsal_changes_nothing():
             assert_array_equal(getattr(ours, name), getattr(other, name))
 
 
-def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
+def test_a_policy_keeps_its_rule_for_what_is_out_of_view(tmp_path):
     camera = load_experiment("vision").camera
     assert camera.noise.invalid_reads == "zero"
     older = random_policy(load_experiment("vision_ideal", ["camera.noise.invalid_reads=edge"]))

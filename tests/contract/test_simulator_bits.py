@@ -95,7 +95,7 @@ def test_a_batch_equals_its_members_alone():
         assert_same(everything(alone), whole, slice(None), slice(e, e + 1))
 
 
-def test_parameters_of_environments_are_their_own():
+def test_parameters_differ_between_environments():
     """Environment e takes entry e modulo the list's length."""
     sim = HybridSim(paper_plant(), 4, ropes=ropes(2))
     reach = -sim.get("payload_pos_w")[:, 2]

@@ -51,7 +51,7 @@ def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
     assert_allclose(env.last["landing_error"], miss, atol=1e-5)
 
 
-def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
+def test_a_moving_goal_is_observed_late_and_its_velocity_is_learnt():
     """Without noise the actor's offset is to the goal of 10 ms ago, and the fit reaches the true
     velocity.
     """
@@ -183,7 +183,7 @@ def test_an_older_policy_was_trained_in_the_wind_of_its_config(tmp_path):
         load_policy(path, "state")
 
 
-def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():
+def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_another():
     params = experiment("state_drag")
     assert (
         ReferenceAdapter(params, realistic=False)._plant.extras.payload_drag

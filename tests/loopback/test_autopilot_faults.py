@@ -141,7 +141,7 @@ def test_refuses_arming(kind, override):
 
 
 @mark.parametrize("kind", ["ardupilot", "px4"])
-def test_arms_where_it_was_told_to(kind):
+def test_arms_on_the_named_port(kind):
     fake, _, told = run(kind, 4.0, armed=False, overrides=(f"{kind}.arm=true",))
     assert "throw" in [state for state, _, _ in told]
     assert "armed" in [text for _, text in fake.events]

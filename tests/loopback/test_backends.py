@@ -110,7 +110,7 @@ def test_units_and_axes_of_commands(kind):
     assert desk.fake.witness.breaches == []
 
 
-def test_what_the_fakes_make_of_a_positive_rate_stands_in_their_own_axes():
+def test_what_the_fakes_make_of_a_positive_rate_stands_in_their_axes():
     """Nose down is stick forward for Betaflight: the raw channels, in the order aileron, elevator,
     throttle, rudder.
     """
@@ -213,7 +213,7 @@ def test_px4_gives_the_vehicle_back_in_position_mode_where_the_config_says_so():
     assert not desk.status.connected, "unasked it is the pilot's"
 
 
-def test_px4_in_position_mode_is_the_pilots_where_its_own_hold_was_asked_for():
+def test_px4_in_position_mode_is_the_pilots_where_its_hold_was_requested():
     desk = Desk("px4").follow()
     desk.turn(0.5, HOVER, HOLD)
     assert desk.status.mode == HOLD
@@ -545,7 +545,7 @@ def test_a_complete_throw(kind, prompt):
         )
 
 
-def test_two_throws_with_the_autopilots_own_hold_between_them():
+def test_two_throws_with_the_autopilots_hold_between_them():
     """From the hold the runner takes the vehicle back for the next throw, and the
     release is new.
     """
@@ -632,7 +632,7 @@ def test_a_mechanism_that_is_open_is_not_taken(kind, closed):
 
 
 @mark.parametrize("kind", ["ardupilot", "px4"])
-def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
+def test_a_mode_is_noticed_soon_though_the_heartbeat_is_slow(kind):
     """PX4's comes once a second and says nothing of a change; it is asked for more often."""
     desk = Desk(kind, prompt=False).follow()
     begin = desk.now

@@ -91,7 +91,7 @@ def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
             stranger.recv(1000)
 
 
-def test_poses_come_on_a_port_of_their_own(wire):
+def test_poses_come_on_a_separate_port(wire):
     """As `ardupilot.toml` has it: the autopilot on its own device, the poses by UDP."""
     run = wire("fake", 'source.device="udp:127.0.0.1:{other}"')
     vehicle, heard = run.peer()

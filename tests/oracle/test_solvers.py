@@ -68,7 +68,7 @@ def test_the_exchange_costs_the_chain_no_accuracy():
     assert exchanged < 4e-4
 
 
-def test_mujoco_ends_the_hard_throw_there_too():
+def test_mujoco_ends_the_hard_throw_at_the_same_place():
     """RK4 has converged at 0.5 ms; measured 0.024 mm."""
     assert off_converged("mujoco_warp", 5e-4) < 1e-4
 
@@ -136,7 +136,7 @@ def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
 
 
 @mark.parametrize(("solver", "substep", "near"), SOLVERS)
-def test_what_stood_still_flies_on_from_there(solver, substep, near):
+def test_what_stood_still_flies_on_from_the_same_state(solver, substep, near):
     sim = HybridSim(on(paper_plant(), solver, substep), 2)
     sim.set_command(np.zeros((2, 4)))
     for _ in range(5):

@@ -73,7 +73,7 @@ def test_pages_do_not_grow():
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in PAGES) <= MOST_WORDS
 
 
-def test_links_and_named_files_are_there():
+def test_links_and_named_files_exist():
     missing = []
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         text = page.read_text(encoding="utf-8")

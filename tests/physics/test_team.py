@@ -73,7 +73,7 @@ def test_one_vehicle_is_the_fused_chain():
     assert_allclose(team.get("pos_w"), single.get("pos_w"), atol=SECOND_ORDER)
 
 
-def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():
+def test_each_end_goes_after_its_lag_and_the_last_one_makes_the_landing():
     params = plant()
     late = replace(params.release, lag=params.release.lag + 0.03)
     sim = hung(params, around(2), releases=[params.release, late])

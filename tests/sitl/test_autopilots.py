@@ -217,7 +217,7 @@ def test_the_release_is_answered_and_moves(bench, kind):
 
 
 @mark.parametrize("kind", KINDS)
-def test_the_autopilots_own_hold_takes_over(bench, kind):
+def test_the_autopilots_hold_takes_over(bench, kind):
     """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its
     estimator is fed with.
     """
@@ -231,7 +231,7 @@ def test_the_autopilots_own_hold_takes_over(bench, kind):
 
 
 @mark.parametrize("kind", KINDS)
-def test_silence_ends_in_the_autopilots_own_hands(bench, kind):
+def test_silence_ends_in_the_autopilots_hands(bench, kind):
     """PX4 leaves OFFBOARD; ArduPilot stays in its mode and levels."""
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     flying(desk)

@@ -111,7 +111,7 @@ class Blind:
     """
 
     def __init__(self, lost=None) -> None:
-        self.looks, self.seen, self._lost = 0, None, lost or {}
+        self.looks, self.last_keypoints, self._lost = 0, None, lost or {}
 
     def lost(self):
         return self._lost
@@ -119,8 +119,11 @@ class Blind:
     def look(self, now, measured, goal_w, carried):
         self.looks += 1
         assert now.pos_w.shape == measured.pos_w.shape == goal_w.shape
-        self.seen = np.zeros((len(goal_w), 8, 2), np.float32), np.zeros((len(goal_w), 8), bool)
-        return self.seen
+        self.last_keypoints = (
+            np.zeros((len(goal_w), 8, 2), np.float32),
+            np.zeros((len(goal_w), 8), bool),
+        )
+        return self.last_keypoints
 
 
 def test_a_throw_flies_on_what_its_eyes_see_alone():

@@ -96,7 +96,7 @@ def folder(tmp_path_factory):
 
 
 @mark.parametrize("name", RUNS)
-def test_two_processes_learn_one_policy_from_data_of_their_own(folder, name):
+def test_two_processes_learn_one_policy_from_separate_data(folder, name):
     first, second = (np.load(folder / f"{name}-{rank}.npz") for rank in range(2))
     assert_array_equal(first["whole"], second["whole"])
     assert not np.array_equal(first["places"], second["places"])
@@ -108,7 +108,7 @@ def test_each_process_goes_on_bit_for_bit_where_it_was(folder, name):
     assert_array_equal(first["whole"], first["resumed"])
 
 
-def test_a_process_that_a_checkpoint_does_not_know_throws_on_its_own(folder):
+def test_a_process_that_a_checkpoint_does_not_know_starts_new_throws(folder):
     """Two processes' checkpoint taken up by three: the third must not collect the first one's data
     again.
     """

@@ -377,9 +377,9 @@ class TeamEnv(VecEnv):
         memory["poses"].copy_(poses)
         period = self.cfg.sim.control_period
         pose = arrays.at_latency(poses, memory["pose_age"] / period)
-        vehicle_seen = pose[:, : ob.VEHICLE]
+        vehicle_measured = pose[:, : ob.VEHICLE]
         offset = ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])
-        frame = torch.cat([vehicle_seen, offset], -1)
+        frame = torch.cat([vehicle_measured, offset], -1)
         frame = frame + torch.randn_like(frame) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":

@@ -61,7 +61,7 @@ class RenderedEyes:
     Attributes:
         frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2),
             validity (8,).
-        seen: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
+        last_keypoints: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class RenderedEyes:
         self._hall: Scenes | None = None
         self._followed: list[BallGoalTracker] = []
         self.frames: list[tuple[ndarray, Tensor, Tensor]] = []
-        self.seen: tuple[ndarray, ndarray] | None = None
+        self.last_keypoints: tuple[ndarray, ndarray] | None = None
         # looks of each vehicle in which it was found
         self._hits = {name: np.zeros(count, int) for name in THINGS}
         self._refused = 0
@@ -147,7 +147,7 @@ class RenderedEyes:
             valid[e] = ok.numpy()
             if e == 0 and self._keep:
                 self.frames.append((picture, one, ok))
-        self.seen = points, valid
+        self.last_keypoints = points, valid
         return points, valid
 
     def lost(self) -> dict[int, str]:

@@ -82,7 +82,7 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Ten
     """Labels of F frames: their true places, float32 unless stated.
 
     ``rays`` by kind, unit ray to the middle, shape (F, 3); ``sizes`` by kind [rad], shape (F,);
-    ``seen`` by kind, whole in view, shape (F,), bool; ``corners``, unit rays, shape (F, 4, 3);
+    ``visible`` by kind, whole in view, shape (F,), bool; ``corners``, unit rays, shape (F, 4, 3);
     ``north``, the world's x in the camera frame, shape (F, 3); ``distractor``, unit ray to
     something else, shape (F, 3).
 
@@ -104,7 +104,7 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Ten
         "distractor": F.normalize(things_c, dim=-1),
     }
     labels = TensorDict(places, batch_size=[len(corners)]).float()
-    labels["seen"] = {"ball": truth.ball_seen, "goal": truth.goal_seen}
+    labels["visible"] = {"ball": truth.ball_visible, "goal": truth.goal_visible}
     return labels.to(device)
 
 
@@ -154,7 +154,7 @@ def search_loss(grids: Tensor, labels: TensorDict, lens: Fisheye) -> Tensor:
         cell = position.floor().long()
         visible = visible & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
         cell = torch.where(visible[:, None], cell, 0)
-        present = labels["seen", kind] & visible
+        present = labels["visible", kind] & visible
         distance = (cells + 0.5 - position[:, None, None]).square().sum(-1)
         same_cell = (cells.long() == cell[:, None, None]).all(-1)
         soft = (
@@ -328,7 +328,7 @@ class Fit:
         radius = point.norm(dim=-1)
         in_front = (views.axes[:, 2] * true).sum(-1) > 0.2
         ratio = (labels["sizes", kind][index] / size).log().abs()
-        present = labels["seen", kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
+        present = labels["visible", kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
         absent = ~in_front | (radius > 1.2)
         judged = present | absent
         loss = F.binary_cross_entropy_with_logits(outputs[:, 0], present.float(), reduction="none")
@@ -429,7 +429,7 @@ class Fit:
 def findings(
     networks: Networks, frame: Tensor, labels: TensorDict, lens: Fisheye
 ) -> dict[str, Tensor]:
-    """Score the places of one frame: logit, whether it is of the thing, error [rad], told
+    """Score the places of one frame: logit, whether it is of the thing, error [rad], predicted
     accuracy [rad]; a row each.
     """
     places = places_of(networks.search(halved(frame)), lens)
@@ -441,7 +441,7 @@ def findings(
         )
         error = _angle_between(rays, labels["rays", kind])
         size = labels["sizes", kind]
-        visible = labels["seen", kind]
+        visible = labels["visible", kind]
         hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
         clear = visible | (error > 2.0 * size)  # else half in view
         if kind == "goal":

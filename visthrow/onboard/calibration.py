@@ -61,7 +61,7 @@ CONSTANTS = {
 """Unknowns that stay the same; see `Spreads`."""
 
 LEAST_STEPS = 75  # of a calibration
-LEAST_SEEN = 0.5  # share of the steps in which the ball is seen
+LEAST_VISIBLE = 0.5  # share of the steps in which the ball is seen
 ROUNDS = 12  # of Gauss-Newton at most
 SETTLED = 1e-3  # step of a constant in its spreads below which it has settled
 OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
@@ -208,10 +208,10 @@ class CalibrationProblem:
         """
         count = len(hovered.time)
         visible = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
-        if count < LEAST_STEPS or visible.mean() < LEAST_SEEN:
+        if count < LEAST_STEPS or visible.mean() < LEAST_VISIBLE:
             raise CalibrationError(
                 f"calibration from {count} steps, the ball seen in {100 * visible.mean():.0f} % of"
-                f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_SEEN:.0f} %"
+                f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_VISIBLE:.0f} %"
             )
         tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
         rope = contract["rope"]
@@ -240,8 +240,8 @@ class CalibrationProblem:
         points = tensor(hovered.keypoints)
         self.ball = _box(points[:, GOAL_KEYPOINTS:])
         self.corners = points[:, :GOAL_KEYPOINTS].mean(1)
-        self.ball_seen = torch.from_numpy(visible)
-        self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
+        self.ball_visible = torch.from_numpy(visible)
+        self.corners_visible = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
         self._set_priors()
 
     def _set_priors(self) -> None:
@@ -361,7 +361,7 @@ class CalibrationProblem:
         box = _box(box_midpoints(points[:, 4:])).unflatten(0, body_w.shape[:2])
         ball = size * box + c["ball"][:, None] - self.ball
         corners = size * middle + c["corners"][:, None] - self.corners
-        visible = (ball * self.ball_seen[:, None], corners * self.corners_seen[:, None])
+        visible = (ball * self.ball_visible[:, None], corners * self.corners_visible[:, None])
         return torch.cat(visible, -1) / (0.5 * s.keypoint + 1e-4)
 
 

@@ -61,7 +61,7 @@ class PilotOutput:
     valid: ndarray | None  # which of them are seen, shape (E, 8), bool
 
 
-class Seen(NamedTuple):
+class PolicyInput(NamedTuple):
     """The observation of one control step, and what is remembered of it."""
 
     observation: Array  # shape (E, D)
@@ -82,7 +82,7 @@ def camera_conditions(params: CameraParams) -> dict[str, Any]:
     return {**same, "mount": mount, "invalid_reads": camera["noise"]["invalid_reads"]}
 
 
-def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
+def with_policy_rule(policy: Policy, params: CameraParams) -> CameraParams:
     """Return a camera with the policy's own rule for what is out of view: it is the program's, not
     the camera's.
     """
@@ -144,7 +144,7 @@ class Pilot:
         if self.layout.name == "vision":
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
-            camera_params = by_own_rule(policy, camera_params)
+            camera_params = with_policy_rule(policy, camera_params)
             policy.require({"camera": camera_conditions(camera_params)}, {"camera"}, allow)
         self.policy = policy
         self.count = count
@@ -217,14 +217,14 @@ class Pilot:
         if keypoints is not None:  # copies: a detector may reuse its arrays
             detected = tuple(self._native(np.array(array)) for array in keypoints)
         self._shown = views, detected
-        seen = self._see(views, detected)
-        if now is not None and self._bridged(now, seen):
-            seen = self._see(views, detected)
-        self._history = seen.history
-        self._answers = seen.answers
-        self._goal_fit = seen.goal_fit
+        inputs = self._see(views, detected)
+        if now is not None and self._bridged(now, inputs):
+            inputs = self._see(views, detected)
+        self._history = inputs.history
+        self._answers = inputs.answers
+        self._goal_fit = inputs.goal_fit
         decided = time.perf_counter()
-        raw, self._memory = self._network.step(seen.observation, self._memory)
+        raw, self._memory = self._network.step(inputs.observation, self._memory)
         action = act.clip_action(raw)
         command = act.command_from_action(action, self._max_thrust, self._max_rate)
         release = act.release_asked(raw, self._threshold)
@@ -237,9 +237,9 @@ class Pilot:
             self._previous,
             np.asarray(command),
             np.asarray(release),
-            np.asarray(seen.observation),
-            None if seen.points is None else np.asarray(seen.points),
-            None if seen.points is None else np.asarray(seen.valid),
+            np.asarray(inputs.observation),
+            None if inputs.points is None else np.asarray(inputs.points),
+            None if inputs.points is None else np.asarray(inputs.valid),
         )
 
     @torch.inference_mode()
@@ -265,13 +265,13 @@ class Pilot:
     def _zeros(self, *shape: int) -> Array:
         return self._native(np.zeros(shape, dtype=np.float32))
 
-    def _bridged(self, timestamp: float, seen: Seen) -> bool:
+    def _bridged(self, timestamp: float, inputs: PolicyInput) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps
         before this one were late or missing.
 
         Args:
             timestamp: of this step [s].
-            seen: in this step.
+            inputs: of this step.
         """
         times = self._times
         period = self.period
@@ -285,9 +285,9 @@ class Pilot:
         errors = [abs(time - when) for time, when in zip(times, due)]
         late = len(due) != len(times) or any(error > JITTER for error in errors)
         if late:
-            self._history = ob.resampled(self._history, seen.history[:, 0], ages, period)
+            self._history = ob.resampled(self._history, inputs.history[:, 0], ages, period)
             if self.layout.response:
-                self._answers = ob.resampled(self._answers, seen.answers[:, 0], ages, period)
+                self._answers = ob.resampled(self._answers, inputs.answers[:, 0], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
         self._times = (timestamp, *times[: rows - 1])
@@ -312,7 +312,7 @@ class Pilot:
             rows.append(self._native(row))
         return rows
 
-    def _see(self, views: list[Array], detected: tuple[Array, Array] | None) -> Seen:
+    def _see(self, views: list[Array], detected: tuple[Array, Array] | None) -> PolicyInput:
         """Assemble the observation of a step from its measurements and what is remembered.
 
         Args:
@@ -351,7 +351,7 @@ class Pilot:
         carried = previous, attached[:, 0], self._history, self._fresh
         further = velocity, places, earlier
         observation, history = ob.observe(layout, frame, filled, *carried, *further)
-        return Seen(observation, history, answers, goal_fit, points, valid)
+        return PolicyInput(observation, history, answers, goal_fit, points, valid)
 
     @torch.inference_mode()
     def see(

@@ -1,4 +1,4 @@
-"""Where policies lie; quick to import, so that a misspelt name is told at once. Onboard-safe."""
+"""Folders of policies. Quick to import: a misspelt name is reported at once. Onboard-safe."""
 
 from pathlib import Path
 

@@ -56,7 +56,7 @@ class ObservationParams(Bounded):
 
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
-    validity: bool  # vision: whether the actor is told which keypoints are valid
+    validity: bool  # vision: whether the actor observes which keypoints are valid
     # age of all that is measured, drawn per episode from this range [s]
     latency: tuple[float, float]
     # of that age, uniform up to this to either side, drawn per step [s]
@@ -193,7 +193,7 @@ PRIVILEGED = (
     "pose_age",
     "vehicle",
 )
-"""What a critic may be told beyond the actor's observation; see
+"""What a critic may observe beyond the actor's observation; see
 :class:`visthrow.training.env.ThrowEnv`.
 """
 

@@ -56,7 +56,7 @@ HIDDEN = (
     "payload_offset",
     "mount.2",
 )
-"""Numbers of vehicle and rope that the actor is not told."""
+"""Numbers of vehicle and rope that the actor does not observe."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Member:
         return act.hover_action(GRAVITY * self.plant.total_mass, self.max_thrust)
 
     @property
-    def told(self) -> list[float]:
+    def given_setup(self) -> list[float]:
         """Set-up that is known of it: throttle in hover, share of what hangs, lag, unit of time
         [s].
         """
@@ -91,8 +91,8 @@ class Member:
 
     @property
     def exact(self) -> list[float]:
-        """Set-up with what nobody is told, those numbers as logarithms."""
-        return [*self.told, *(math.log(abs(self._number(path))) for path in HIDDEN)]
+        """Set-up with the hidden numbers, as logarithms."""
+        return [*self.given_setup, *(math.log(abs(self._number(path))) for path in HIDDEN)]
 
     def _number(self, path: str) -> float:
         if hasattr(self.plant.vehicle, path.split(".")[0]):
@@ -105,7 +105,7 @@ class Member:
 
     def setup(self, kind: str) -> list[float]:
         """Return the set-up of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
-        return {"none": [], "told": self.told, "exact": self.exact}[kind]
+        return {"none": [], "told": self.given_setup, "exact": self.exact}[kind]
 
 
 def members(experiment: Experiment) -> list[Member]:
@@ -164,8 +164,8 @@ def specialised(
     units, and its experiment.
 
     Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board
-    knows that it was for many. Raises PolicyError: the policy is none for many vehicles, or is told
-    what only a simulator knows of one."""
+    knows that it was for many. Raises PolicyError: the policy is none for many vehicles, or it
+    observes what only a simulator knows of one."""
     observation = policy.contract.get("observation", {})
     if (
         "fleet" not in policy.contract

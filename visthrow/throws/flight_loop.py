@@ -34,15 +34,15 @@ class Sight(Protocol):
     """A camera and a detector on each of E vehicles: keypoints from pictures.
 
     Attributes:
-        seen: keypoints and validity of the last picture, (E, 8, 2) and (E, 8).
+        last_keypoints: keypoints and validity of the last picture, (E, 8, 2) and (E, 8).
     """
 
-    seen: tuple[ndarray, ndarray] | None
+    last_keypoints: tuple[ndarray, ndarray] | None
 
     def look(
         self, snapshot: Snapshot, measured: Snapshot, goal_w: ndarray, carried: ndarray
     ) -> tuple[ndarray, ndarray]:
-        """Take a picture on each vehicle and return ``seen``.
+        """Take a picture on each vehicle and return ``last_keypoints``.
 
         Args:
             snapshot: true states. measured: states that the detector knows attitude and height of.
@@ -144,14 +144,14 @@ class Policies(Pilots):
     def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
         outs = []
         goal_w = flight.goal_at(snapshot.time)
-        looked = None
+        sighted = None
         if self.eyes is not None:  # nobody looks any more once all have let go
             if np.any(flight.flown):
-                looked = self.eyes.look(flight.plant.exposed, snapshot, goal_w, snapshot.attached)
+                sighted = self.eyes.look(flight.plant.exposed, snapshot, goal_w, snapshot.attached)
             else:
-                looked = self.eyes.seen
+                sighted = self.eyes.last_keypoints
         for pilot, part in zip(self.pilots, self.slices):
-            keypoints = None if looked is None else (looked[0][part], looked[1][part])
+            keypoints = None if sighted is None else (sighted[0][part], sighted[1][part])
             views = [getattr(snapshot, name)[part] for name in VIEWS]
             outs.append(pilot.act(*views, goal_w[part], snapshot.attached[part], keypoints))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
@@ -216,7 +216,7 @@ class Flight:
         recorder: FlightObserver | None = None,
         home_w: ndarray | None = None,
     ) -> None:
-        """Take over a plant at its start; each period is told to the recorder.
+        """Take over a plant at its start; the recorder receives each period.
 
         ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the
         vehicles are."""

@@ -57,8 +57,10 @@ class ThrowRecorder(FlightObserver):
         throws = sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = state.time
-        looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
-        points, valid = looked or self.pilots.pilots[0].see(
+        sighted = (
+            self.pilots.eyes.last_keypoints if self.pilots.eyes is not None and throws else None
+        )
+        points, valid = sighted or self.pilots.pilots[0].see(
             snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, self.pilots.goal_w
         )
         keypoints = {"keypoints": points[0], "keypoints_valid": valid[0]}

@@ -248,7 +248,7 @@ def work(
         units, folder: what is wanted, and where each result is written when it is done.
         function: of a unit, importable by its name; returns columns and extra figures.
         recorded: results from elsewhere, by key; they count as done.
-        processes, say: 1 works in this one; told of the progress.
+        processes, say: 1 works in this one; receives the progress.
     """
     results = {**load_all([folder]), **(recorded or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())

@@ -237,7 +237,7 @@ class Trainer:
         rank = self.ranks.rank
         has_state = rank < len(saved["ranks"])
         state = saved["ranks"][rank if has_state else 0]
-        self.algorithm.load_state_dict(state["algorithm"], own_throws=has_state)
+        self.algorithm.load_state_dict(state["algorithm"], keep_throws=has_state)
         if not has_state:  # with another's episodes it would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return

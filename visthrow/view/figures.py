@@ -42,7 +42,7 @@ class Line:
     x: Sequence[float]
     intervals: Sequence[Interval]
     series: int = 0
-    own: int | None = None  # index of the point at the policy's own value
+    trained_at: int | None = None  # index of the point at the policy's own value
 
 
 @dataclass(frozen=True)
@@ -294,8 +294,8 @@ def _curve(axis, line: Line):
     low, value, high = np.array([(i.low, i.value, i.high) for i in line.intervals]).T
     axis.fill_between(x, low, high, color=colour, **LOOKS["band"])
     (curve_line,) = axis.plot(x, value, marker + "-", color=colour, **LOOKS["curve"])
-    if line.own is not None:
-        axis.plot(x[line.own], value[line.own], "o", **LOOKS["own"])
+    if line.trained_at is not None:
+        axis.plot(x[line.trained_at], value[line.trained_at], "o", **LOOKS["own"])
     return curve_line
 
 

@@ -62,14 +62,14 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     height = 1.18 + upper + 0.98 + PANEL + 0.08
     figure = plt.figure(figsize=(WIDTH, height))
     lens = KeypointCamera(drawn_larger(camera))
-    all_seen = True
+    all_visible = True
     for column, (caption, time) in enumerate(views):
         x = LEFT_MARGIN + column * (PANEL + GAP)
         axis = figure.add_axes((x / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
         _side_view(axis, log, time, side, column)
         axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - start:.2f} s", loc="left")
         axis = figure.add_axes((x / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
-        all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
+        all_visible &= _camera_view(axis, log, lens, time, first=column == 0)
     texts = {"x": LEFT_MARGIN / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
@@ -82,7 +82,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
         " flight."
     )
     figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {legend}", **quiet)
-    unseen = "" if all_seen else "; a cross: outside the field of view"
+    unseen = "" if all_visible else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
     note = (
         f"The same instants on the fisheye image ({field}): corners of the target square, box of"

@@ -40,7 +40,7 @@ class Rule:
     # write the bits, the first of the values, or the maximum, where the operator asked for it
     write: bool = False
     optional: bool = False  # firmware without it is right as well
-    warns: bool = False  # a mismatch is told, and flown with
+    warns: bool = False  # a mismatch is reported, and flown with
 
     def good(self, value: float) -> bool:
         """Return whether a value is as required."""
@@ -90,7 +90,7 @@ class Audit:
     """Asks for parameters one by one and judges them.
 
     Attributes:
-        found: values by name. refused: why a value is not told, by name. written: names that were
+        found: values by name. refused: why a value did not come, by name. written: names that were
             changed.
         problems: mismatches in words, once the audit is done.
     """
@@ -161,7 +161,7 @@ class Audit:
             answers = {name: f": {why}" for name, why in self.refused.items()}
             answers |= {name: f" is {x:g}" for name, x in self.found.items()}
             self.problems = [
-                f"{r.name}{answers.get(r.name, ' was not told')}; expected {r.words}"
+                f"{r.name}{answers.get(r.name, ' did not come')}; expected {r.words}"
                 for r in self._wrong()
                 if not r.warns
             ]

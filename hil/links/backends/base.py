@@ -194,7 +194,7 @@ class Release:
         """Take an answer: True accepted, False refused, None at work on it."""
         if self.state != PENDING or not self.sends:
             return
-        self.at = None  # heard: not to be told again
+        self.at = None  # heard: not to be sent again
         if self._sent is not None:
             self.answers.append(perf_counter() - self._sent)
             self._sent = None

@@ -99,8 +99,8 @@ def listen(
     """Connect, and put what comes: None once connected, the bodies of a frame, a text for what
     could not be taken, a number of datagrams of others.
 
-    A frame or a body that raises is told, and the next one taken. Ends by what connecting raises,
-    or once ``going`` returns False.
+    A frame or a body that raises is reported, and the next one taken. Ends by what connecting
+    raises, or once ``going`` returns False.
     """
     capture = connect(system, options)
     put(None)

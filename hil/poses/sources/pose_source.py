@@ -77,7 +77,7 @@ class RecordedSource(Source):
         self.poses = sorted(poses, key=lambda pose: pose.arrival)
         if not self.poses:
             why = (
-                "; ".join(f"{n} {entry.text()}" for entry, n in roster.seen.items())
+                "; ".join(f"{n} {entry.text()}" for entry, n in roster.received.items())
                 if roster
                 else ""
             )

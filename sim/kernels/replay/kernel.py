@@ -105,7 +105,7 @@ DATA_FIELDS = {
     "command_time": "real",
     "command": "vec4",
     "vehicle_time": "real",
-    "vehicle_quat": "quat",  # measured; attitudes are told against them
+    "vehicle_quat": "quat",  # measured; attitudes are expressed relative to them
     "payload_time": "real",
     "gyro_time": "real",
 }

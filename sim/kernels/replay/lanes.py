@@ -52,14 +52,14 @@ class Recording:
         self.data = data
         self.rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
         self.seconds = windows["end"] - windows["start"]
-        self._there: dict[tuple[rk.ReplayKernel, str], tuple] = {}
+        self._uploaded: dict[tuple[rk.ReplayKernel, str], tuple] = {}
 
     def on(self, kernel: rk.ReplayKernel, device: str) -> tuple:
         """Return windows and recorded data as a kernel's structs on a device."""
-        if (kernel, device) not in self._there:
+        if (kernel, device) not in self._uploaded:
             windows = _struct(kernel.Windows, self.windows, device)
-            self._there[kernel, device] = windows, _struct(kernel.Data, self.data, device)
-        return self._there[kernel, device]
+            self._uploaded[kernel, device] = windows, _struct(kernel.Data, self.data, device)
+        return self._uploaded[kernel, device]
 
 
 def still(count: int, segments: int) -> dict[str, ndarray]:

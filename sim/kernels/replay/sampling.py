@@ -58,8 +58,8 @@ def see_pose(x: Any, com: Any, pos_w: Any, quat_wb: Any, reference: Any):
     """
     frame = rotation_of_vector(quat_wb, x.frame_tilt)
     point = pos_w + wp.quat_rotate(quat_wb, x.marker_offset - com)
-    quat_seen = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
-    turn = vector_of_rotation(pos_w, wp.quat_inverse(reference) * quat_seen)
+    quat_measured = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
+    turn = vector_of_rotation(pos_w, wp.quat_inverse(reference) * quat_measured)
     return (type(x.scale)(1.0) + x.scale) * wp.quat_rotate(frame, point), turn
 
 

@@ -80,5 +80,5 @@ def test_records_refuse_what_they_are_not(kept):
         report.record_path("../x")
 
 
-def test_mistakes_are_told(refused):
+def test_mistakes_are_reported(refused):
     refused("bench records no_such_record", said="no record")

@@ -90,7 +90,7 @@ def test_a_ball_is_where_it_is_looked_for():
         assert within[first + 9] < within[first + 8], "and closer again"
 
 
-def test_what_is_lost_for_long_is_not_seen():
+def test_what_is_lost_for_long_is_not_visible():
     rots, rays = throw()
     read, _, within = followed(rots, rays, range(10, 40))
     seen = ~np.isnan(read)
@@ -224,7 +224,7 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
     assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
 
 
-def test_a_thing_that_is_seen_elsewhere_is_followed_anew():
+def test_a_thing_that_is_found_elsewhere_is_followed_anew():
     rots, rays = throw(8)
     following = BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
     ball = lambda ray: BallSeen(ray, math.asin(RADIUS / LENGTH), 1.0)  # noqa: E731

@@ -141,7 +141,7 @@ def test_the_payloads_box_is_smooth():
     assert torch.autograd.gradcheck(lambda p: payload_keypoints(CENTRED, p)[0], (ball_c,))
 
 
-def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
+def test_target_past_90_degrees_is_visible_and_the_sky_is_not():
     # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front:
     # 102 deg off the axis.
     pos_w, _ = hover(1.0)

@@ -66,7 +66,7 @@ def test_what_invalid_and_dropped_points_read(reads, expected):
     assert torch.allclose(points[0], torch.tensor([*expected, [0.11, 0.21]]))
 
 
-def test_wrong_points_lie_anywhere_in_the_image_and_count_as_seen():
+def test_wrong_points_lie_anywhere_in_the_image_and_count_as_visible():
     params = KeypointNoiseParams(wrong_probability=0.25)
     generator = torch.Generator().manual_seed(1)
     wrong = torch.rand(SAMPLES, 8, 3, generator=generator)

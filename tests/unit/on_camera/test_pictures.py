@@ -42,12 +42,12 @@ def test_overlay_colours_the_points_and_leaves_the_input():
 
 def test_overlay_marks_invalid_points_even_far_outside():
     points, valid = throw_scene()
-    all_seen = draw_overlay(CAMERA, points, valid)
+    all_visible = draw_overlay(CAMERA, points, valid)
     points[0] = torch.tensor([1e9, -1e9])
     valid = valid.clone()
     valid[0] = False
     image = draw_overlay(CAMERA, points, valid)
-    assert not np.array_equal(image, all_seen)
+    assert not np.array_equal(image, all_visible)
     assert image[:8, -8:].max() > 100, "cut off to the image's corner"
     with raises(ValueError, match="expected \\(320, 320, 3\\)"):
         draw_overlay(CAMERA, points, valid, np.zeros((10, 10, 3), np.uint8))

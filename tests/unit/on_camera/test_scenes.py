@@ -74,8 +74,8 @@ def test_ball_and_square_are_where_the_lens_puts_them(renderer):
     assert_allclose(
         centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE
     )
-    assert truth.ball_seen.all()
-    assert truth.goal_seen.all()
+    assert truth.ball_visible.all()
+    assert truth.goal_visible.all()
     assert not image[0, 0].any(), "black outside the field of view"
 
 

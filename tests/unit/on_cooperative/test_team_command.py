@@ -34,5 +34,5 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
     np.testing.assert_allclose(centres, track.pos_w, atol=1e-6)
 
 
-def test_a_policy_that_is_not_there_is_told(tmp_path, refused):
+def test_a_missing_policy_is_reported(tmp_path, refused):
     refused(f"cooperative fly trio --out {tmp_path}", said="no policy 'trio'")

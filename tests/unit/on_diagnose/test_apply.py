@@ -234,7 +234,7 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
         ),
     ],
 )
-def test_mistakes_are_told(diagnosis, changes, message, tmp_path, refused):
+def test_mistakes_are_reported(diagnosis, changes, message, tmp_path, refused):
     out = tmp_path / "x.toml"
     refused(f"diagnose apply {diagnosis(**changes)} --out {out}", said=message)
     assert not out.exists()

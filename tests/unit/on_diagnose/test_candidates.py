@@ -106,7 +106,7 @@ class Sideways(SyntheticModel):
         return windows
 
 
-def test_of_causes_of_which_only_one_is_there_that_one_is_named():
+def test_of_causes_of_which_only_one_exists_that_one_is_named():
     """The simulated set holds a cause near 0; without it the other has hardly been listed."""
     model = Sideways(effects=catalogue(20), truth={"effect_01": 40.0}, throws=6, free=2)
     assert explain_without_laws(model).named == ("effect_01",)

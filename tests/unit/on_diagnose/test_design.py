@@ -102,7 +102,7 @@ def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
 
 
 @mark.parametrize("name", ["cf_payload", "nanobench_cf21"])
-def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name):
+def test_the_simulated_flight_of_a_setup_is_one_that_its_model_explains(name):
     """The log's input, attitude and path belong together by the setup's own numbers: hardly
     anything is left without any effect.
     """

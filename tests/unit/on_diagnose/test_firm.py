@@ -91,7 +91,7 @@ def test_names_that_held_out_flights_do_not_confirm_are_none(
     assert said in diagnosis.reasons[0]
 
 
-def test_the_test_that_failed_is_told_with_the_flight_that_would_settle_it(monkeypatch):
+def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(monkeypatch):
     """Here the names bring the nats that they promise, and no channel's error falls for sure."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
     gain = result.ChannelGain("pos_w", "m", 0.02, 0.019, 0.01, float("nan"), 0.05, -0.1, 0.2, ())
@@ -191,7 +191,7 @@ def test_a_withdrawn_class_is_one_candidate(monkeypatch):
     assert diagnosis.reasons[0].startswith("1 named, 1 candidate besides")
 
 
-def test_two_causes_that_may_be_two_others_are_told():
+def test_two_causes_that_may_be_two_others_are_reported():
     sets = [
         (("lag", "drag"), 0.0),
         (("lag", "mass"), 0.4),

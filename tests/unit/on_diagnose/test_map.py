@@ -226,7 +226,7 @@ def unnamed(
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_about(seed):
+def test_metres_with_radians_are_distinguished_from_centimetres_with_degrees_or_asked_about(seed):
     """About the origin both stay in a hall, and a hundredth of the path is near a 57th
     of the lean.
     """

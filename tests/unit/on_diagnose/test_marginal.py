@@ -97,7 +97,7 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         assert likelihood(of, choice, 0) == approx(dense_value, abs=1e-3)
 
 
-def test_broken_derivatives_are_told_with_their_window(fitted):
+def test_broken_derivatives_are_reported_with_their_window(fitted):
     gram = fitted[4][3]
     with raises(
         DiagnoseError,

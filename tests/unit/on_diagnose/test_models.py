@@ -243,7 +243,7 @@ class TestFlyer:
         unaware = diagnose_flights.explain(FlyerModel(logs, LATE_FLYER))
         assert all("/d" not in law.formula for law in unaware.laws)
 
-    def test_what_neither_name_nor_law_explains_is_told(self):
+    def test_what_neither_name_nor_law_explains_is_reported(self):
         logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
         diagnosis = explain_without_laws(FlyerModel(logs, LATE_FLYER))
         assert diagnosis.overall in ("UNKNOWN", "EXPLAINED IN PART")
@@ -268,7 +268,7 @@ class TestFlyer:
         return model
 
     @mark.parametrize("stated", [(), ("wind_x=0", "wind_y=0")])
-    def test_wind_is_told_as_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
+    def test_wind_is_named_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
         model = self.in_wind(monkeypatch, 0.1, drag=0.03, wind=1.5)
         model.effects = measures.narrowed(model.effects, measures.parsed(stated))
         found = explain_without_laws(model)
@@ -511,7 +511,7 @@ class TestSetups:
         assert vehicle.body.mass == approx(FLYER.mass + 0.01)
         assert vehicle.aero.drag_x == vehicle.aero.drag_y == approx(FLYER.drag_xy + 0.02)
 
-    def test_fit_refuses_what_is_not_there(self):
+    def test_fit_refuses_what_the_logs_lack(self):
         model = BallModel([ball_log()], BALL)
         with raises(DiagnoseError, match="did you mean 'ball_drag'"):
             fitting.fit(model, ["bal_drag"])

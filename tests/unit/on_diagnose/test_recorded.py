@@ -51,7 +51,7 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
     assert np.sum(time <= 4.0) == approx(1000, abs=3)
 
 
-def test_a_log_without_commands_is_told_what_makes_them():
+def test_a_log_without_commands_is_answered_with_what_makes_them():
     """As PX4's, which holds motor outputs, poses and rates."""
     log = level_log(np.arange(20.0), np.zeros((20, 3)))
     with raises(DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"):

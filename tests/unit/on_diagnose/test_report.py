@@ -58,7 +58,7 @@ def found():
     return model, explain_without_laws(model)
 
 
-def test_landings_are_told_in_millimetres(found, measured):
+def test_landings_are_reported_in_millimetres(found, measured):
     """Before, after with causes sized by the other flights, and by each cause alone; in sentences
     too.
     """
@@ -83,7 +83,7 @@ def measured(found):
     return gain.measure(found[1])
 
 
-def test_flights_without_a_landing_that_was_seen_have_no_gain_in_landings(found, monkeypatch):
+def test_flights_without_a_measured_landing_have_no_gain_in_landings(found, monkeypatch):
     model, diagnosis = found
     points = np.empty((0, 3))
     nothing = PredictedLandings(np.empty(0, int), points, points, points)
@@ -358,7 +358,7 @@ def test_the_recording_is_written(tmp_path, found):
         ("check nothing.npz --json .", "it is a folder; expected a file"),
     ],
 )
-def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
+def test_mistakes_on_the_command_line_are_reported(capsys, tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
     assert run_command(f"diagnose {arguments}") == 2
     printed = capsys.readouterr()

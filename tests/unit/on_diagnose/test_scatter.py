@@ -100,7 +100,7 @@ def test_what_is_drawn_anew_each_day_drifts():
     assert not any(on_days(rng, 0.0, 0.0) for _ in range(20))
 
 
-def test_a_drift_is_told_with_its_size_and_its_days():
+def test_a_drift_is_reported_with_its_size_and_its_days():
     found = Scatter(
         "lag_jitter",
         "The lag varies",
@@ -125,7 +125,7 @@ def share(j, group, size):
     return {Candidate(group, (j,), group, deviations=(1.0,)): size}
 
 
-def test_a_mean_is_as_sure_as_there_are_days():
+def test_a_mean_is_as_certain_as_its_number_of_days():
     """Three flights of a day tell no more of what all days share than one does."""
     statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
     by_flight, by_day = (freed(statistics, share(0, who, 6.0), days) for who in (FLIGHT, DAY))
@@ -209,7 +209,7 @@ def delay_jitter(diagnosis):
     return next(s for s in diagnosis.scatter if s.name == "cmd_jitter")
 
 
-def test_what_flights_have_of_their_own_is_integrated_out():
+def test_what_single_flights_differ_by_is_integrated_out():
     found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
     left, own, score = (
         freed(found, share(j, FLIGHT, size)),
@@ -317,7 +317,7 @@ def jitter(found, again):
     return verdicts.share_verdict(linear, share, frozenset(offered[:1]), {}, EFFECT, LEAST)
 
 
-def test_flights_far_apart_are_told_by_simulations_where_they_lie():
+def test_flights_far_apart_are_judged_by_simulations_where_they_lie():
     with_it = [jitter(*world(seed)) for seed in range(40)]
     without = [jitter(world(seed)[0], None) for seed in range(40)]
     assert all(s.found for s in with_it)

@@ -158,7 +158,7 @@ def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, ev
     assert explain_without_laws(model).events == events
 
 
-def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
+def test_signs_that_change_from_flight_to_flight_are_reported_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
     diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
@@ -262,7 +262,7 @@ def test_an_estimate_stays_within_its_physical_bounds():
     assert diagnosis.overall == result.UNKNOWN
 
 
-def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
+def test_an_interval_that_shrinks_onto_a_bound_is_reported_in_words():
     model = SyntheticModel(truth={"effect_03": -5.0}, seed=2)
     model.effects = tuple(
         replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS

@@ -262,7 +262,7 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
     return FlightLog({**log.channels, **extra}, {})
 
 
-def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
+def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
     camera = load_experiment("state").camera
     logs = [looked_at(log, camera) for log in planted[0]]
     names = [*HIDDEN, "marker_rot_x"]
@@ -302,7 +302,7 @@ def test_a_manoeuvre_is_planned_beside_a_camera(planted):
     assert {e.name for e in flown.model.effects} == {"com_x", "camera_focal"}
 
 
-def test_mistakes_are_told(planted):
+def test_mistakes_are_reported(planted):
     logs, _ = planted
     with raises(DiagnoseError, match="no effect '"):
         ThrowModel(logs, paper_plant(), only=["no_such"])

@@ -171,7 +171,7 @@ class PassedBy(Pushed):
         return -size * np.exp(-0.5 * (since / width) ** 2)
 
 
-def test_a_law_that_other_flights_do_not_repeat_is_not_told():
+def test_a_law_that_other_flights_do_not_repeat_is_not_printed():
     diagnosis = diagnose_flights.explain(PassedBy(law="passing", law_size=0.4, seed=3))
     assert diagnosis.overall == result.UNKNOWN
     (reason,) = [r for r in diagnosis.reasons if "left out do not repeat it" in r]

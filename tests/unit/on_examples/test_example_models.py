@@ -42,7 +42,7 @@ def swing_log(length, viscous, coulomb, quadratic, offset) -> FlightLog:
     return log_at(time, angle=angle + offset + default_rng(1).normal(0, 2e-4, len(time)))
 
 
-def test_frictions_are_told_apart():
+def test_frictions_are_distinguished():
     log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
     truth = {
         "pendulum_length": 0.01,

@@ -1,5 +1,5 @@
-"""The parameter audit: asked for until answered, judged, written only where the operator said so, and
-the release's book-keeping.
+"""The parameter audit: values are requested until the vehicle answers, judged, and written only
+where the operator asked for it; and the book-keeping of the release.
 """
 
 from pytest import approx
@@ -52,10 +52,10 @@ def audit(values, write=False):
     return box[0], asked, written, tables, now
 
 
-def test_a_parameter_that_is_not_told_is_a_mismatch():
+def test_a_parameter_that_does_not_come_is_a_mismatch():
     values = {k: v for k, v in GOOD.items() if k != "ATC_ANGLE_BOOST"}
     found, asked, _, tables, now = audit(values)
-    assert found.problems == ["ATC_ANGLE_BOOST was not told; expected 0"]
+    assert found.problems == ["ATC_ANGLE_BOOST did not come; expected 0"]
     assert GIVE_UP < now < GIVE_UP + 0.1
     assert 20 <= asked.count("ATC_ANGLE_BOOST") <= 27, "asked again and again"
     assert "no answer" in tables[0]

@@ -161,7 +161,7 @@ def hall():
     return made
 
 
-def test_tilt_latency_and_thrust_are_found_in_the_runners_own_hover(hall):
+def test_tilt_latency_and_thrust_are_found_in_the_runners_hover(hall):
     found = hall.runner.calibrating.calibration
     assert found is not None, hall.runner.calibrating.problems()
     np.testing.assert_allclose(np.degrees(found.turn_b), TILT_DEG, atol=0.15)
@@ -236,7 +236,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     assert Spreads().keypoint == 0.01
 
 
-def test_a_hover_that_shows_too_little_is_told():
+def test_a_hover_that_shows_too_little_is_reported():
     params = run_params()
     contract = Policy.load(find_policy("vision")).contract
     rows = 100

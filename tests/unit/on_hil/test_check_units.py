@@ -29,7 +29,7 @@ def checked(monkeypatch, printed):
 
 
 @mark.parametrize("quat", [(0.0,) * 4, (math.nan,) * 4])
-def test_an_attitude_that_is_none_is_told_in_words(checked, quat):
+def test_an_attitude_that_is_none_is_reported_in_words(checked, quat):
     """Of the vehicle it fails; no library's sentence on quaternions comes up."""
     fails = [line for line in checked(quat=quat) if line.startswith("FAIL")]
     assert len(fails) == 2, "the vehicle's alone"

@@ -30,12 +30,12 @@ def test_samples_are_forward_right_down_and_the_force_turned_round():
     assert len(values) == 18
 
 
-def test_a_program_that_is_not_there_is_named(tmp_path):
+def test_a_missing_program_is_named(tmp_path):
     with raises(RunError, match=r"no firmware at .*nothing"):
         Firmware(tmp_path / "nothing", tmp_path)
 
 
-def test_a_program_that_ends_at_once_is_told(tmp_path, monkeypatch):
+def test_a_program_that_ends_at_once_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(
         firmware, "PORTS", (free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM))
     )

@@ -82,7 +82,7 @@ def test_every_case_both_ways_against_matrices(axes, order):
         assert same_turn(back.quat, pose.quat)
 
 
-def test_our_own_frame_changes_no_bit():
+def test_our_frame_changes_no_bit():
     rng = default_rng(2)
     for _ in range(50):
         pose = random_pose(rng)

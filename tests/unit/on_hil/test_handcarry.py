@@ -98,7 +98,7 @@ def test_every_axis_case_is_named(steps, axes):
         assert not wrong.mirrored
 
 
-def test_a_left_handed_world_is_told(track):
+def test_a_left_handed_world_is_reported(track):
     mirrored = [
         Pose(p.stamp, p.arrival, p.body, (p.pos[0], -p.pos[1], p.pos[2]), p.quat) for p in track
     ]
@@ -119,7 +119,7 @@ def test_moves_that_were_left_out_are_counted():
     assert len(MOVES) == 8
 
 
-def test_a_live_source_is_told_the_next_move_and_left_when_all_are_made(track):
+def test_a_live_source_asks_for_the_next_move_and_left_when_all_are_made(track):
     told, clock = [], ManualClock()
     later = Pose(99.0, 99.0, "vehicle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     steps = collect(RecordedSource([*track, later]), clock, 60.0, told.append)

@@ -81,7 +81,7 @@ class Blind(Detector):
         return FrameDetections(BallSeen(np.array([0.0, 0.0, 1.0]), 0.1, 1.0), None)
 
 
-def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypatch):
+def test_a_custom_detector_is_named_by_the_configuration(pictures, monkeypatch):
     params = ImageParams("camera", fisheye=SMALL, by="blind")
     with raises(ConfigError, match=r"images.by 'blind'; known: contours, learnt"):
         Eyes(params, training())
@@ -102,7 +102,7 @@ class Known(Blind):
         return replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
 
 
-def test_what_a_camera_mounted_otherwise_sees_is_told_in_that_of_training(pictures, monkeypatch):
+def test_what_a_camera_mounted_otherwise_sees_is_given_in_that_of_training(pictures, monkeypatch):
     """Pitched by 30 degrees its axis points forward and down: x of the body is up in the image of
     training.
     """
@@ -194,7 +194,7 @@ SQUARE = tuple(
 
 
 @mark.parametrize("reads", ["edge", "zero"])
-def test_what_is_not_seen_any_more(reads):
+def test_what_is_not_visible_any_more(reads):
     lens = training()
     camera = KeypointCamera(replace(lens, noise=replace(lens.noise, invalid_reads=reads)))
     detections, level = Detections(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
@@ -228,7 +228,7 @@ def test_what_is_not_seen_any_more(reads):
     assert_array_equal(again, points, "an older frame changes nothing")
 
 
-def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
+def test_a_live_camera_is_read_in_a_separate_thread(pictures):
     class Capture:
         def __init__(self):
             self.frames, self.released = iter(pictures[:2]), False

@@ -79,7 +79,7 @@ def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(comma
     assert estimate.shown_age == approx(min(late, trained))
 
 
-def test_a_detector_is_told_the_payloads_distance_while_it_hangs():
+def test_a_detector_receives_the_payloads_distance_while_it_hangs():
     runner = watched(late=0.0)
     hint = runner.estimator.hint(0.39)
     assert hint.ball_distance == approx((0.5 * runner.hang, 1.4 * runner.hang))

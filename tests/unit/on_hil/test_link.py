@@ -118,7 +118,7 @@ def test_other_device_strings_are_refused(text):
         check_device(text, remote=True)
 
 
-def test_loopback_only_unless_told_otherwise():
+def test_loopback_only_unless_configured_otherwise():
     with raises(LinkError, match="leaves this machine"):
         check_device("udp:0.0.0.0:14550")
     assert check_device("udp:192.168.1.2:14550", remote=True).host == "192.168.1.2"

@@ -49,7 +49,7 @@ def vision(i, reset=0):
     )
 
 
-def test_vision_poses_of_a_bin_with_stamps_of_their_own(tmp_path):
+def test_vision_poses_of_a_bin_with_separate_stamps(tmp_path):
     path = tmp_path / "a.BIN"
     files.write_bin(path, {"VISP": files.VISP}, [vision(i, int(i >= 3)) for i in range(5)])
     poses = read_bin(path, VEHICLE)

@@ -45,7 +45,7 @@ class System:
         self.rigidBodies = next(self._frames)
 
 
-def test_rigid_bodies_by_name_from_a_thread_of_their_own():
+def test_rigid_bodies_by_name_from_a_separate_thread():
     frames = [{"quad": body(1.0), "other": body(9.0)}, {"ball": body(2.0), "quad": body(1.5)}]
     system, asked, now = System(frames), [], [5.0]
     module = SimpleNamespace(connect=lambda *args: asked.append(args) or system)

@@ -132,7 +132,7 @@ def test_little_data_and_a_still_vehicle_say_nothing():
     assert unit_problems([], frames) == []
 
 
-def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, refused):
+def test_a_recording_in_wrong_units_is_refused_unless_they_are_named(tmp_path, refused):
     params = flight("crazyflie_log", vel_w="m/s")
     with raises(
         SourceError,

@@ -78,7 +78,7 @@ def test_a_stranger_is_refused_counted_and_said_once():
     assert who.summary()["refused_most"][0]["count"] == who.refused == 50
 
 
-def test_what_a_party_sends_beside_its_own_is_neither_taken_nor_said():
+def test_what_a_party_sends_beside_its_role_is_neither_taken_nor_said():
     who, said = roster(VEHICLE)
     assert who.admit(pose(), A, 0.0)
     assert not who.admit(beat(), A, 0.1)
@@ -140,7 +140,7 @@ def test_no_flood_fills_the_memory():
     who, said = roster()
     for i in range(20_000):
         who.admit(pose(system=9, component=i % 256), ("10.0.0.9", 1 + i), 0.0)
-    assert len(who.seen) <= MOST_KEPT + 1
+    assert len(who.received) <= MOST_KEPT + 1
     assert who.refused == 20_000
     assert len(said) <= 20
 

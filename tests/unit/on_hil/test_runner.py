@@ -94,7 +94,7 @@ def test_a_body_that_was_reset_on_the_ground_is_taken_again():
     assert decisions[-1].state == "throw"
 
 
-def test_a_payload_that_is_seen_again_in_its_fall_is_farther_off_than_its_cable():
+def test_a_payload_that_reappears_in_its_fall_is_farther_off_than_its_cable():
     latch = next(d.time for d in thrown()[1] if d.release)
 
     def blink(time, poses):
@@ -201,7 +201,7 @@ GOAL = (
 
 
 @mark.parametrize("x", [2.0, 9.0])
-def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_seen(x):
+def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_visible(x):
     """The configured goal, which would lie outside, is none then."""
 
     def with_goal(time, poses):

@@ -55,7 +55,7 @@ def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
 
 @mark.parametrize("axis", range(3))
 @mark.parametrize("side", [-1, 1])
-def test_vehicle_and_payload_have_boxes_of_their_own(axis, side):
+def test_vehicle_and_payload_have_separate_boxes(axis, side):
     for name, low, high in (
         ("vehicle", FENCE.vehicle_low, FENCE.vehicle_high),
         ("payload", FENCE.payload_low, FENCE.payload_high),

@@ -68,7 +68,7 @@ def test_a_full_disk_troubles_nobody(wire, tmp_path):
     assert logged.log.failed == 1
 
 
-def test_a_port_that_is_not_there_is_named_once():
+def test_a_missing_port_is_named_once():
     importorskip("serial")
     with raises(LinkError) as caught:
         SerialPort(Device("serial", "/dev/no_such_port", 115200))

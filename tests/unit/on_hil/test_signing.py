@@ -54,7 +54,7 @@ def test_files_that_are_no_key(tmp_path, data, mode, text):
         read_key(tmp_path / "none")
 
 
-def test_pymavlinks_own_check_takes_what_we_send():
+def test_pymavlinks_check_takes_what_we_send():
     theirs = mav.MAVLink(None, 1, 1)
     theirs.signing.secret_key = KEY
     ours = Signed(KEY, 245, 191)

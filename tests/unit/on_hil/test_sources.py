@@ -39,7 +39,7 @@ def local_position(time_ms=1000):
     return mav.MAVLink_local_position_ned_message(time_ms, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
 
 
-def test_bodies_are_told_apart_by_their_senders():
+def test_bodies_are_distinguished_by_their_senders():
     decoder = MavlinkDecoder(BODIES)
     assert decoder.feed(wired(mocap(), 1, 9), 0.0).body == "vehicle"
     assert decoder.feed(wired(mocap(), 2, 1), 0.0) is None
@@ -112,7 +112,7 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
             writer.write(wired(message, 1, component))
         writer.close()
         assert read_tlog(tmp_path / "x.tlog", senders, roster) == []
-    reasons = {seen.why: count for seen, count in roster.seen.items() if seen.why}
+    reasons = {entry.why: count for entry, count in roster.received.items() if entry.why}
     assert reasons == {
         "frame LOCAL_FLU is not taken; expected LOCAL_NED or LOCAL_FRD": 1,
         "no ATTITUDE_QUATERNION or ATTITUDE within 50 ms of it": 1,

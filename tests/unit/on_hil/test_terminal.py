@@ -65,7 +65,7 @@ def test_only_a_second_ctrl_c_raises(typed):
     os.kill(os.getpid(), signal.SIGINT)
     assert terminal.words("throw").abort
     with raises(KeyboardInterrupt):
-        terminal._told_to_end(signal.SIGINT, None)
+        terminal._handle_signal(signal.SIGINT, None)
 
 
 @mark.parametrize("number", PAUSING)

@@ -82,7 +82,7 @@ def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, px4)
     assert any(word in text for text in rows)
 
 
-def test_a_reset_of_the_estimate_is_told(px4):
+def test_a_reset_of_the_estimate_is_reported(px4):
     rows = check([px4(resets=1)])[0].rows
     assert any("reset 1 times" in row.text for row in rows if row.channel == "pos_w")
 

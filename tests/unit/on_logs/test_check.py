@@ -215,7 +215,7 @@ def test_a_late_channel_that_no_model_reads_refuses_no_log():
     assert refused_of(checked, known(None)) == ()
 
 
-def test_a_contradiction_is_told_before_a_model_is_built():
+def test_a_contradiction_is_reported_before_a_model_is_built():
     columns = flight()
     columns["rate_b"] = columns["rate_b"] * 57.3
 
@@ -225,7 +225,7 @@ def test_a_contradiction_is_told_before_a_model_is_built():
     assert diagnose([log_of(columns)], build).overall == "DATA INCONSISTENT"
 
 
-def test_a_pose_stream_of_another_clock_is_told():
+def test_a_pose_stream_of_another_clock_is_reported():
     columns = flight()
     late = np.column_stack(
         [np.interp(columns["time"] - 0.035, columns["time"], c) for c in columns["pos_w"].T]
@@ -309,7 +309,7 @@ def test_commands_that_oppose_a_swing_are_not_late():
         (0.3, 0.2, True),
     ],
 )
-def test_a_payload_that_leaves_before_its_command_is_told(late, step, told):
+def test_a_payload_that_leaves_before_its_command_is_reported(late, step, told):
     columns = carrying()
     gone = np.maximum(columns["time"] - 6.0, 0.0)
     columns["payload_pos_w"] -= np.outer(gone, [2.4, 0.0, 3.2])
@@ -329,7 +329,7 @@ def test_a_payload_that_waits_on_the_floor_does_not_leave_before_its_command():
     assert "before its release" not in faults(log_of(columns, release_command=pressed))
 
 
-def test_a_drifting_clock_is_told():
+def test_a_drifting_clock_is_reported():
     columns = flight(40.0)
     stretched = columns["time"] * 1.001
     columns["est_pos_w"] = np.column_stack(
@@ -348,7 +348,7 @@ def test_deviations_of_delays_hold_what_they_say():
 
 
 @mark.parametrize("width", [0.05, 0.3])
-def test_a_delay_that_noise_hides_is_not_told(width):
+def test_a_delay_that_noise_hides_is_not_reported(width):
     """Slow motion of one message: no delay, and no deviation of a few milliseconds."""
     for seed in range(6):
         rng, time = default_rng(seed), np.arange(0.0, 20.0, 0.02)
@@ -485,7 +485,7 @@ def test_an_autopilot_that_says_once_that_it_flies_is_no_fault():
     assert check([log])[0].verdict == "ok"
 
 
-def test_no_more_seconds_are_flown_than_there_are():
+def test_no_more_seconds_are_flown_than_were_logged():
     """Samples in pairs: the median step is half of the mean one, or twice."""
     columns = flight(20.0, scale=0.1)
     for nearer in (0.004, 0.016):
@@ -653,7 +653,7 @@ def test_thrust_that_answers_gusts_is_on_no_other_clock(stiffness, damping, last
 
 
 @mark.parametrize(("turned_deg", "exchanged"), [(0.0, False), (50.0, False), (90.0, True)])
-def test_an_accelerometer_that_its_own_axes_fit_is_not_exchanged(turned_deg, exchanged):
+def test_an_accelerometer_that_its_axes_fit_is_not_exchanged(turned_deg, exchanged):
     """Half a quarter turn is no exchange: what fits a little worse as it is belongs there."""
     time = np.arange(0.0, 30.0, 0.01)
     turns = np.outer(time, [1.9, 2.3, 1.1]) + [0.0, 1.0, 2.0]

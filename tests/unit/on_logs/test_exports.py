@@ -261,7 +261,7 @@ def test_what_nothing_checks_is_asked(head, proposed):
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
-def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, proposed):
+def test_velocities_of_the_world_and_of_the_body_are_distinguished(frame, proposed):
     # it turns about itself all the while
     turn = Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
     vel = np.gradient(POS, TIME, axis=0)

@@ -305,7 +305,7 @@ class TestTables:
         (log,) = read(tmp_path / "c.csv", columns)
         assert log["x"].values == approx([2, 4, 6])
 
-    def test_clocks_of_their_own_and_splits(self, tmp_path):
+    def test_separate_clocks_and_splits(self, tmp_path):
         rows = ["t,u,b,v", *(f"{10 * i},{2 * i},{'ab'[i // 50]},{i}" for i in range(100))]
         logs = read_rows(
             tmp_path,
@@ -440,7 +440,7 @@ class TestAutopilots:
 @mark.parametrize(
     "path", sorted((config.configs_root() / "diagnose").glob("*.toml")), ids=lambda p: p.stem
 )
-def test_shipped_mappings_name_channels_with_a_meaning_where_there_is_one(path):
+def test_shipped_mappings_name_channels_with_a_meaning_where_one_exists(path):
     setup = setups.load(path.stem)
     names = [channel.name for channel in setup.table.channels]
     assert len(set(names)) == len(names)

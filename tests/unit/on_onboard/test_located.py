@@ -106,7 +106,7 @@ def test_one_wrong_point_of_each_is_outvoted():
     assert (found[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
 
 
-def test_what_is_not_seen_is_nought():
+def test_what_is_not_visible_is_zero():
     layout, camera, frame, valid, _, ray = scene()
     valid = valid.clone()
     valid[:4, :4] = False

@@ -78,7 +78,7 @@ def test_what_is_older_than_the_throw_is_its_first_step():
     assert found[0, :, 0].tolist() == approx([6.0, 4.0, 1.0, 1.0])
 
 
-def test_a_release_that_was_not_done_is_not_told():
+def test_a_release_that_was_not_done_is_not_reported():
     pilot = Pilot(simple_policy((-0.1, 0.3, 0.0, 0.0, 1.0)))
     before = pilot.previous_action[0, 4]
     seen(pilot, 0.0, 0.0)

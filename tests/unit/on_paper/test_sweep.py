@@ -194,12 +194,12 @@ def run(path, out, minutes=None, **told):
     return starter, pool.ProcessPool(work, out, starter, lambda text: None).run(minutes)
 
 
-def test_a_task_is_told_how_many_minutes_are_left(path, tmp_path):
+def test_a_task_receives_how_many_minutes_are_left(path, tmp_path):
     starter, _ = run(path, tmp_path, minutes=9.0)
     assert starter.minutes == approx(9.0, abs=0.5)
 
 
-def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tmp_path):
+def test_everything_is_done_once_and_no_more_at_once_than_fit(path, tmp_path):
     starter, outcome = run(path, tmp_path)
     assert outcome == pool.Outcome()
     names = [name for name, _ in starter.started]
@@ -214,7 +214,7 @@ def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tm
     assert outcome == pool.Outcome()
 
 
-def test_a_failure_stops_nothing_else_and_is_told(path, tmp_path):
+def test_a_failure_stops_nothing_else_and_is_reported(path, tmp_path):
     _, outcome = run(path, tmp_path, fails=["state_rigid_cable"])
     assert len(outcome.failed) == 2
     assert all("exit status 1" in reason for reason in outcome.failed.values())

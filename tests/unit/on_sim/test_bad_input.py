@@ -107,7 +107,7 @@ def test_no_tethers():
         (lambda sim: sim.get("position"), r"no array 'position'; there are .*pos_w"),
     ],
 )
-def test_shapes_and_names_are_told_with_a_rope_and_without(call, message):
+def test_shapes_and_names_are_reported_with_a_rope_and_without(call, message):
     for sim in (HybridSim(PLANT, 3), bare_quadrotor(PLANT.vehicle, 3)):
         with raises(ValueError, match=message):
             call(sim)

@@ -57,7 +57,7 @@ def test_the_voltage_of_a_hover():
     assert thrust == approx(0.66)
 
 
-def test_what_the_block_has_no_number_for_is_told():
+def test_what_the_block_has_no_number_for_is_reported():
     told = left_out(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
     assert [text.split()[0] for text in told] == ["tpa_rate", "d_max"]
     assert left_out(SETTINGS | {"d_max": "0,0,0"}) == []

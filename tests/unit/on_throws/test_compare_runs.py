@@ -63,7 +63,7 @@ def test_a_row_a_policy_and_target():
     assert first.throws[0].summary()["throws"] == 0, "the state policy did not throw at 1.5 m"
 
 
-def test_policies_of_one_name_are_told_apart():
+def test_policies_of_one_name_are_distinguished():
     names = [entry.name for entry in from_runs.entries([log(sha="a"), log(sha="b")])]
     assert names == ["vision aaaaaaaa", "vision bbbbbbbb"]
 

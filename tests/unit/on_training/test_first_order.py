@@ -64,7 +64,7 @@ def decided(fo, obs):
 
 def backward(fo, by):
     """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop."""
-    for name, tensor in (fo.flights.adjoint | {"seen": fo.layers.by_seen}).items():
+    for name, tensor in (fo.flights.adjoint | {"seen": fo.layers.by_observation}).items():
         tensor.zero_()
         if name in by:
             tensor.view(-1, *by[name].shape)[-1] = by[name]

@@ -60,7 +60,7 @@ def test_poses_and_commands_read_back_as_they_were_flown(flown):
     assert_array_equal(sent, log["command"].values)
 
 
-def test_every_channel_is_there_with_its_unit_and_schema(flown):
+def test_every_channel_exists_with_its_unit_and_schema(flown):
     log = FlightLog.load(flown / "flight.npz")
     with (flown / "flight.mcap").open("rb") as file:
         summary = reader.make_reader(file).get_summary()

@@ -123,7 +123,7 @@ def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
     assert config.load(Experiment, copy) == config.load(Experiment, shipped)
 
 
-def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
+def test_a_base_that_is_nowhere_suggests_its_kind(tmp_path):
     (tmp_path / "mine.toml").write_text('base = "visoin.toml"', encoding="utf-8")
     with raises(ConfigError, match=r"did you mean 'train/vision\.toml'") as caught:
         config.load(Experiment, tmp_path / "mine.toml")

@@ -109,12 +109,12 @@ def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
     assert with_drag == {f"aero.{f.name}" for f in fields(AeroParams) if f.name != "kind"}
 
 
-def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them():
+def test_the_environment_flies_every_vehicle_with_its_limits_and_reports_them():
     env = ThrowEnv(experiment("task.start.tether_variants=2"), "cpu", seed=1, count=12)
-    drawn, told = members(env.cfg), env.get_observations()["actor"][:, -4:]
+    drawn, given_setup = members(env.cfg), env.get_observations()["actor"][:, -4:]
     for e in range(12):
         own = drawn[e % 6 // 2]
-        assert told[e].tolist() == approx(own.told, rel=1e-6)
+        assert given_setup[e].tolist() == approx(own.given_setup, rel=1e-6)
         assert (
             float(env.delay.age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
         )

@@ -59,7 +59,7 @@ def test_a_command_is_one_that_a_shell_takes(monkeypatch):
     assert provenance.command() == "python -m visthrow.cli demo"
 
 
-def test_commit_of_a_copy_without_history_is_what_it_was_told(monkeypatch, tmp_path):
+def test_commit_of_a_copy_without_history_is_what_was_given(monkeypatch, tmp_path):
     monkeypatch.setattr(
         provenance, "__file__", str(tmp_path / "visthrow" / "common" / "provenance.py")
     )

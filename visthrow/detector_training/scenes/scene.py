@@ -314,8 +314,8 @@ class Truth:
     # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
     corners_c: Tensor
     rot_wc: Tensor  # camera to world, shape (E, 3, 3)
-    ball_seen: Tensor  # whole in the field of view, shape (E,), bool
-    goal_seen: Tensor  # likewise
+    ball_visible: Tensor  # whole in the field of view, shape (E,), bool
+    goal_visible: Tensor  # likewise
 
     @property
     def ball_ray(self) -> Tensor:
@@ -348,5 +348,5 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     ball_c = static_c[:, 4]
     extremes_c = ball_extremes_c(lens, ball_c, float(scenes.ball[0, 3]))
     _, sides = lens.project_normalized(extremes_c)
-    ball_seen = sides.all(1) & visible[:, 4]
-    return Truth(ball_c, static_c[:, :4], rot, ball_seen, visible[:, :4].all(1))
+    ball_visible = sides.all(1) & visible[:, 4]
+    return Truth(ball_c, static_c[:, :4], rot, ball_visible, visible[:, :4].all(1))

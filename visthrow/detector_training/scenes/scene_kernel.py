@@ -142,7 +142,7 @@ def lit(normal: wp.vec3, light: LightRow) -> float:
 
 
 @wp.func
-def felt(normal: wp.vec3, turn: wp.quat, colour: wp.vec3, seam: wp.vec3) -> wp.vec3:
+def ball_colour(normal: wp.vec3, turn: wp.quat, colour: wp.vec3, seam: wp.vec3) -> wp.vec3:
     """A tennis ball: felt with a seam."""
     n = wp.quat_rotate_inv(turn, normal)
     off = wp.abs(n[2] - 0.45 * wp.sin(2.0 * wp.atan2(n[1], n[0])))
@@ -303,7 +303,7 @@ def radiance(
     if sphere_depth < depth:
         depth = sphere_depth
         normal = (eye + ray * sphere_depth - centre) / ball.radius
-        colour = felt(normal, ball.turn, ball.colour, ball.seam) * lit(normal, light)
+        colour = ball_colour(normal, ball.turn, ball.colour, ball.seam) * lit(normal, light)
     if hides(scene.rope, eye, ray, centre, depth):
         colour = scene.rope.colour
     return wp.cw_mul(colour, light.colour)

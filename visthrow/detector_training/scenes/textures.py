@@ -1,6 +1,6 @@
 """Photographs as textures: those that scikit-image ships, or a folder of one's own.
 
-scikit-image's wheel holds them with their licences told in ``skimage.data``: brick, grass, gravel
+scikit-image's wheel holds them with their licences named in ``skimage.data``: brick, grass, gravel
 and coffee are CC0, rocket and astronaut NASA's (public domain), motorcycle of the Middlebury stereo
 data, chelsea CC0, color and cell of its contributors."""
 

@@ -34,11 +34,11 @@ DEFAULT_FREE = {
     "imu": ("thrust_gain", "thrust_curve", "motor_tau", "cmd_delay", "inertia_xy", "inertia_z"),
     "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
 }
-"""Model -> effects that are fitted where none are named; what cannot be told from the logs keeps
+"""Model -> effects that are fitted where none are named; what the logs cannot determine keeps
 its prior.
 """
 ROUNDS = 4
-# an effect whose deviation is still this share of its prior was not told by the logs
+# an effect whose deviation is still this share of its prior was not determined by the logs
 UNKNOWN_SHARE = 0.5
 
 

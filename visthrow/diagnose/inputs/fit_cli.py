@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     result = fitting.fit(model, free)
     for i, name in enumerate(result.names):
         low, high = result.interval(i)
-        note = "" if result.identified[i] else "   not told by these logs"
+        note = "" if result.identified[i] else "   not determined by these logs"
         print(
             f"{name:<20} {result.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {result.units[i]}{note}"
         )

@@ -22,7 +22,7 @@ from visthrow.logs.mapping import TableMap, TimeColumn
 from visthrow.logs.readers.table import Table, logs_of
 from visthrow.logs.unit_names import UNITS, fitting_units
 
-# of rotors, by mass; without any, wind would be told as a tilt (Faessler et al. 2018) [1/s]
+# of rotors, by mass; without any, wind would be named as a tilt (Faessler et al. 2018) [1/s]
 _DRAG = 0.3
 _TIMES = ("s", "ms", "us", "ns")
 _STEP = (2e-4, 0.25)  # between two rows of a log [s]
@@ -261,7 +261,7 @@ def _usual(total: np.ndarray) -> float:
 
 
 def _driving(log: FlightLog, proposal: MappingProposal) -> str:
-    """The input that the force follows best, "" where that cannot be told."""
+    """The input that the force follows best, "" where that cannot be determined."""
     inputs = [name for name in thrust_checks.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust_checks.follows(log, name)) is not None}
     if len(inputs) < 2 or not scores:

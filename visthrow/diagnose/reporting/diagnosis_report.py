@@ -140,7 +140,7 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
 
 def instead(diagnosis: Diagnosis) -> list[str]:
     """A line for each set of causes that says the same with several others; single ones that do are
-    told as a class.
+    reported as a class.
     """
     lines: list[str] = []
     named = set(diagnosis.theta)

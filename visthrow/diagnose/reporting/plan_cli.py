@@ -1,4 +1,4 @@
-"""``visthrow diagnose plan``: the flight that tells most of what could not be told, with its
+"""``visthrow diagnose plan``: the flight that determines most of what is undetermined, with its
 reference to fly.
 """
 

@@ -239,7 +239,7 @@ def _better(relation: relations.Relation, whose: str = "") -> str:
 def _late(relation: relations.Relation, channels: str, figures: dict, one_clock: bool) -> Row:
     """Report the delay of a second measurement of one motion, and its remedy."""
     if relation.delay_sd > _UNTOLD:
-        text = "how late the second is cannot be told: too slow, or too noisy"
+        text = "how late the second is cannot be determined: too slow, or too noisy"
         return Row("delay", channels, "ok", text, figures)
     text = (
         f"the second is {1e3 * relation.delay:+.1f} ms behind the first (sd"
@@ -568,9 +568,7 @@ def _followed(relation: relations.Relation, channels: str, spread: float, period
     hint = hint if "degrees" in hint else ""  # a gain may be any other number
     weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
-    when = (
-        f"{1e3 * relation.delay:.1f} ms later" if is_measured else "at a delay that cannot be told"
-    )
+    when = f"{1e3 * relation.delay:.1f} ms later" if is_measured else "at an unknown delay"
     text = (
         f"the rates follow {when}, correlation {relation.correlation:.2f}, gain"
         f" {relation.scale:.2f}"

@@ -211,7 +211,7 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     sources = {_pose_part(tap): (tap, data) for tap in reversed(taps) if _fits(tap, message, data)}
     together = [*sources]
     if "quat_wb" not in sources:
-        for name, source in _own_attitude(taps, log).items():
+        for name, source in _estimated_attitude(taps, log).items():
             sources.setdefault(name, source)
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
@@ -254,7 +254,7 @@ def _fits(tap: Tap, message: str, fields: Fields) -> bool:
     return tap.message == message and all(column in fields for column in tap.columns.split())
 
 
-def _own_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
+def _estimated_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
     """Return where the vehicle's own attitude and rates stand."""
     sources: dict[str, tuple[Tap, Fields]] = {}
     for tap in taps:

@@ -20,7 +20,7 @@ from visthrow.common.storage import counted
 from visthrow.common.toml_text import tables_beside
 
 MARKS = (",", ";", "\t", " ")
-SAMPLED = 60  # lines of numbers by which the separator is told
+SAMPLED = 60  # lines of numbers from which the separator is determined
 _UNIT_WORDS = tables_beside(__file__)
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 _WORDS = ("true", "false")

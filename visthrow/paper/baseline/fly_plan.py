@@ -179,7 +179,7 @@ def pendulum_state(snapshot: Snapshot, mount_b: ndarray) -> ndarray:
 class Delays:
     """Delays that the controller compensates [s]."""
 
-    measurement: float = 0.0  # age of what it is told
+    measurement: float = 0.0  # age of the measurement
     command: float = 0.0  # from a command to its effect
     release: float = 0.0  # from the latch to separation
 

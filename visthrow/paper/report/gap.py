@@ -34,7 +34,7 @@ class GapSweep:
     key: str
     title: str
     xlabel: str
-    own: float  # in the units of the axis; the value that both policies are flown with
+    trained_at: float  # in the units of the axis; the value that both policies are flown with
     scale: float = 1.0  # of the axis; of a range the mean counts
     policies: tuple[str, ...] = ("vision",)
 
@@ -56,7 +56,7 @@ def section(thrown: ResultSet) -> Section:
         for series, policy in enumerate(SHIPPED[::-1]):
             points = curve(thrown, sweep, policy) if policy in sweep.policies else []
             if len(points) > 1:
-                lines.append(line(f"{policy} policy", points, series, sweep.own))
+                lines.append(line(f"{policy} policy", points, series, sweep.trained_at))
                 rows += _rows(sweep, points)
         if not lines:
             missing.append(sweep.title)
@@ -92,12 +92,12 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
     }
     nominal = thrown.shipped(policy, PLANT, TARGET)
     if nominal is not None and points:
-        points[sweep.own] = nominal
+        points[sweep.trained_at] = nominal
     return sorted(points.items())
 
 
 def _rows(sweep: GapSweep, points: Points) -> Iterator[dict[str, str]]:
-    nominal = dict(points).get(sweep.own)
+    nominal = dict(points).get(sweep.trained_at)
     for value, r in points:
         added = "its own" if r is nominal else "-"
         if nominal is not None and r is not nominal:

@@ -27,7 +27,7 @@ def throws_section(thrown: ResultSet) -> Section:
         result = thrown.shipped(name, plant, target)
         if result is not None:
             rows.append(_row(result))
-        elif wanted_there(plant, target):
+        elif is_reported(plant, target):
             missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
     lead = Text(
         "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
@@ -50,7 +50,7 @@ def throws_section(thrown: ResultSet) -> Section:
     )
 
 
-def wanted_there(plant: str, target: float) -> bool:
+def is_reported(plant: str, target: float) -> bool:
     """Whether the report wants policies thrown there: on the plain reference plant at one target
     alone.
     """
@@ -98,7 +98,7 @@ def vision_section(thrown: ResultSet) -> Section:
     for (i, plant), target in product(enumerate(PLANTS), TARGETS):
         pair = _groups(thrown, plant, target)
         if pair is None:
-            if wanted_there(plant, target):
+            if is_reported(plant, target):
                 missing.append(f"{target:g} m on the {SHORT[plant]}")
             continue
         vision, state, runs = pair

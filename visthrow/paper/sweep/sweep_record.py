@@ -1,4 +1,4 @@
-"""What is told and kept of a list: a line a run, and two records, of the trainings and of the
+"""What is printed and kept of a list: a line a run, and two records, of the trainings and of the
 throws.
 """
 

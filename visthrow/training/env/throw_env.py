@@ -338,8 +338,8 @@ class ThrowEnv(VecEnv):
                 rot_wb = ob.rotation_in(pose)
             payload_w = pose[:, ob.VEHICLE :]
             points, valid = self.view.look(pose[:, :3], rot_wb, late_goal, payload_w, fresh)
-            vehicle_seen = measured[:, : ob.VEHICLE]
-            measured = torch.cat([vehicle_seen, points.flatten(1)], dim=-1)
+            vehicle_measured = measured[:, : ob.VEHICLE]
+            measured = torch.cat([vehicle_measured, points.flatten(1)], dim=-1)
         self.measured = measured, valid
         time = self.episode_length_buf.float() * self.cfg.sim.control_period
         goal_vel = places = answers = None

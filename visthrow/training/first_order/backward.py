@@ -129,7 +129,9 @@ def advance(
 
 
 @wp.func
-def show(p: BackwardParams, x: Course, seen: wp.array2d(dtype=float), k: int, e: int, share: float):
+def show(
+    p: BackwardParams, x: Course, observation: wp.array2d(dtype=float), k: int, e: int, share: float
+):
     """Add the share of an observation that state k has, with the payload as it was up to
     ``history`` steps before.
     """
@@ -137,18 +139,18 @@ def show(p: BackwardParams, x: Course, seen: wp.array2d(dtype=float), k: int, e:
     forward = wp.quat_rotate(rot, wp.vec3(1.0, 0.0, 0.0))
     left = wp.quat_rotate(rot, wp.vec3(0.0, 1.0, 0.0))
     for i in range(3):
-        seen[e, i] += share * x.pos[k, e][i]
-        seen[e, 3 + i] += share * x.vel[k, e][i]
-        seen[e, 6 + i] += share * x.response[k, e][1 + i]
-        seen[e, 9 + i] += share * forward[i]
-        seen[e, 12 + i] += share * left[i]
+        observation[e, i] += share * x.pos[k, e][i]
+        observation[e, 3 + i] += share * x.vel[k, e][i]
+        observation[e, 6 + i] += share * x.response[k, e][1 + i]
+        observation[e, 9 + i] += share * forward[i]
+        observation[e, 12 + i] += share * left[i]
     for i in range(2):
-        seen[e, GOAL_AT + i] -= share * x.load_pos[k, e][i]
+        observation[e, GOAL_AT + i] -= share * x.load_pos[k, e][i]
     for age in range(p.history + 1):
         before = wp.max(k - age, 0)
         offset = x.load_pos[before, e] - x.pos[before, e]
         for i in range(3):
-            seen[e, LOAD_AT + 3 * age + i] += share * offset[i]
+            observation[e, LOAD_AT + 3 * age + i] += share * offset[i]
 
 
 @wp.kernel(module="unique", enable_backward=True)
@@ -163,16 +165,16 @@ def step(
     action: wp.array3d(dtype=float),
     # Out:
     made: Course,  # of no use but for the derivatives, which it shares with x
-    seen: wp.array2d(dtype=float),  # observation k + 1
+    observation: wp.array2d(dtype=float),  # observation k + 1
 ):
     e = wp.tid()
     if k < steps[e]:
         advance(p, x, made, action, k, e)
         late = p.age[e] / p.period
-        show(p, x, seen, k + 1, e, 1.0 - late)
-        show(p, x, seen, k, e, late)
+        show(p, x, observation, k + 1, e, 1.0 - late)
+        show(p, x, observation, k, e, late)
         for j in range(5):
-            seen[e, PREVIOUS_AT + j] += wp.clamp(action[k, e, j], -1.0, 1.0)
+            observation[e, PREVIOUS_AT + j] += wp.clamp(action[k, e, j], -1.0, 1.0)
 
 
 class Layers:
@@ -185,7 +187,7 @@ class Layers:
         self._network = network
         self._obs = obs
         self.action, self.by_action = obs.new_zeros(2, *obs.shape[:2], actions.ACTIONS)
-        self.by_seen = torch.zeros_like(obs[0])
+        self.by_observation = torch.zeros_like(obs[0])
 
     def _decide(self, obs: Tensor) -> Tensor:
         return self._network.mlp(self._network.obs_normalizer(obs))
@@ -204,9 +206,11 @@ class Layers:
         """
         rows = _picked(flown)
         with torch.enable_grad():
-            seen = self._obs[k, rows].detach().requires_grad_()
-            action = self._decide(seen)
-        (self.by_seen[rows],) = torch.autograd.grad(action, seen, self.by_action[k, rows])
+            observation = self._obs[k, rows].detach().requires_grad_()
+            action = self._decide(observation)
+        (self.by_observation[rows],) = torch.autograd.grad(
+            action, observation, self.by_action[k, rows]
+        )
 
     def gradients(self, flown: Tensor, shares: Tensor) -> None:
         """Give the weights their derivatives from the steps that were flown, bool, shape (T, E);

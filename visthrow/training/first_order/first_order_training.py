@@ -276,7 +276,7 @@ class FirstOrder(Algorithm):
         for name, gradient in zip(STATES, by_states):
             flights.adjoint[name][: T + 1] = gradient
         self.layers.by_action[:T] = by_action
-        self.layers.by_seen.zero_()
+        self.layers.by_observation.zero_()
         self.backward()
         return figures | {"cost": cost}
 
@@ -305,7 +305,7 @@ class FirstOrder(Algorithm):
             wp.from_torch(flights.steps),
             wp.from_torch(layers.action, grad=layers.by_action),
             flights.made,
-            wp.from_torch(torch.zeros_like(layers.by_seen), grad=layers.by_seen),
+            wp.from_torch(torch.zeros_like(layers.by_observation), grad=layers.by_observation),
         )
         return [
             wp.launch(
@@ -379,8 +379,8 @@ class FirstOrder(Algorithm):
     def state_dict(self) -> dict:
         return super().state_dict() | {"adapting": self._adapting, "surrogate": self.surrogate}
 
-    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        super().load_state_dict(saved, own_throws)
+    def load_state_dict(self, saved: dict, keep_throws: bool = True) -> None:
+        super().load_state_dict(saved, keep_throws)
         if saved["adapting"]:
             self._adapt()
         for name, value in saved["surrogate"].items():

@@ -57,9 +57,9 @@ class Algorithm(ABC):
         """Tensors and numbers that the next iteration depends on, besides torch's generators."""
         return {name: getattr(self, name).state_dict() for name in (*self.parts, "env")}
 
-    def load_state_dict(self, saved: dict[str, Any], own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start
-        anew.
+    def load_state_dict(self, saved: dict[str, Any], keep_throws: bool = True) -> None:
+        """Restore a state of :meth:`state_dict`, bit for bit. Without ``keep_throws`` episodes
+        start anew.
         """
-        for name in (*self.parts, *["env"] * own_throws):
+        for name in (*self.parts, *["env"] * keep_throws):
             getattr(self, name).load_state_dict(saved[name])

@@ -125,7 +125,7 @@ class PPOTraining(Algorithm):
             self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
         self.alg.actor_learns.fill_(float(iteration >= first))
 
-    def load_state_dict(self, saved: dict[str, Any], own_throws: bool = True) -> None:
-        super().load_state_dict(saved, own_throws)
+    def load_state_dict(self, saved: dict[str, Any], keep_throws: bool = True) -> None:
+        super().load_state_dict(saved, keep_throws)
         for key, value in self.env.get_observations().items():
             self._obs[key].copy_(value)

@@ -24,7 +24,7 @@ CHANNELS = ("acc_b", "rate_b")
 COLUMNS = slice(3, 4), slice(0, 3)  # of the state that these channels show
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
 OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
-# correlation of angular acceleration with the commands' torques, from which inertia is told: 0.99
+# correlation of angular acceleration with the commands' torques, which determines inertia: 0.99
 # in simulated flights, 0.2 to 0.5 in fast flights of a Crazyflie, which the air turns as well
 FOLLOWS = 0.8
 SMOOTHING = 0.05  # of the gyro for its slope [s]
@@ -145,4 +145,4 @@ def _why_not(turned: Sequence[Relation], source: str) -> str:
     )
     if worst.nats > 0.0:
         reason += f"; as ({worst.axes}) it is {worst.axes_correlation:.2f}: motors in another order"
-    return f"{reason}; acc_b alone is looked at, and no torque or inertia is told"
+    return f"{reason}; acc_b alone is used, and no torque or inertia is fitted"
