@@ -131,11 +131,14 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
     diagnosis = explain_without_laws(
         SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
     )
-    findings = [replace(f, low=-f.low) if f.name == "effect_05" else f for f in diagnosis.findings]
+    findings = [
+        replace(f, low=-f.low, verdict=result.CANDIDATE) if f.name == "effect_05" else f
+        for f in diagnosis.findings
+    ]
     wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
     assert (wide.overall, dict(wide.theta)) == (result.UNKNOWN, {})
     assert wide["effect_05"].verdict == result.CANDIDATE
-    assert "holds 0" in wide.reasons[0]
+    assert "intervals hold 0" in wide.reasons[0]
     assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
     findings = [replace(f, nats=-1.0) if f.name == "effect_05" else f for f in findings]
     unasked = held_out.judged(replace(diagnosis, findings=tuple(findings)))["effect_05"]

@@ -124,6 +124,40 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     assert diagnosis["effect_03"].manoeuvres
 
 
+def test_a_cause_is_a_candidate_where_a_set_without_it_is_nearly_as_likely():
+    """Its evidence exceeds the threshold by 1.2 nats: odds of three to one."""
+    truth = {"effect_03": 12.0, "effect_05": 3.3}
+    diagnosis = explain_without_laws(SyntheticModel(truth=truth, seed=5, throws=8, free=2))
+    assert diagnosis["effect_05"].nats > diagnosis.threshold
+    assert [set(names) for names, _ in diagnosis.sets] == [{*truth}, {"effect_03"}]
+    assert diagnosis["effect_05"].verdict == result.CANDIDATE
+    assert diagnosis["effect_03"].verdict == result.FOUND
+    assert diagnosis.named == ("effect_03",)
+    odds = np.exp(-diagnosis.sets[1][1])
+    assert f"(odds {odds:.2g})" in diagnosis["effect_05"].sentence
+
+
+def test_two_causes_are_classes_with_one_that_stands_in_for_both():
+    """Effect 8 acts as effects 3 and 4 together, but for a seventh of what it does by itself."""
+
+    def change(model, window):
+        floor = [e.floor for e in model.effects]
+        columns = window.effects.copy()
+        both = floor[3] * columns[:, 3] + floor[4] * columns[:, 4]
+        columns[:, 8] = both / floor[8] + 0.132 * columns[:, 8]
+        both = model._answer(columns, {"effect_03": 20.0, "effect_04": 20.0})
+        return replace(window, effects=columns, residual=window.residual + both)
+
+    diagnosis = explain_without_laws(altered(change, seed=3))
+    assert [set(names) for names, _ in diagnosis.sets] == [
+        {"effect_03", "effect_04"},
+        {"effect_08"},
+    ]
+    group = {f.name: f.partners for f in diagnosis.findings if f.verdict == result.CLASS}
+    assert {*group} == {"effect_03", "effect_04", "effect_08"}
+    assert group["effect_03"] == group["effect_04"] == ("effect_08",)
+
+
 def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model = SyntheticModel(truth={"effect_03": 12.0}, seed=2)
     model.effects = tuple(

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Sets
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, POSSIBLE, Sets
 from visthrow.diagnose.models.model_interface import Effect
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.point import Point
@@ -50,7 +50,8 @@ class Reading:
     point: Point  # with random shares integrated out
     active: Sequence[int]  # effects that are named
     withdrawn: set[int]  # those whose names were withdrawn
-    sets: Sets
+    sets: Sets  # with the random shares of the best
+    all_sets: Sets  # each with the effects that vary among flights in it
     unlike: float  # variance among flights, in what is allowed
 
     def finding(self, j: int) -> Finding:
@@ -105,18 +106,39 @@ class Reading:
         """Return the partners of an effect, and the set that it belongs to: the best, or another
         that explains the flights as well.
 
-        Partners are a named effect and the new ones of sets of as many that do without it.
+        Partners are a named effect and the new ones of its rivals.
         """
         active = self.active
-        alike = [members for members, _ in self.sets if len(members) == len(active)]
         for home in active:
-            rivals = [members for members in alike if home not in members]
-            others = {*active} - {home}
+            rivals = self._rivals(home)
+            others = {*active, *self.withdrawn} - {home}
             partners = {home}.union(*rivals) - others
             if j in partners and len(partners) > 1:
                 together = active if j == home else next(m for m in rivals if j in m)
                 return tuple(sorted(partners - {j})), tuple(together)
         return (), tuple(active)
+
+    def _rivals(self, home: int) -> list[tuple[int, ...]]:
+        """Return the sets that do without an effect, of any size, unless a part of one is likelier.
+
+        Source: Madigan and Raftery 1994, the second principle of Occam's window.
+        """
+        without = [(members, nats) for members, nats in self.sets if home not in members]
+        rivals = []
+        for members, nats in without:
+            parts = [of_part for part, of_part in without if {*part} < {*members}]
+            if nats < min(parts, default=np.inf):
+                rivals.append(members)
+        return rivals
+
+    def _odds_of_none(self, members: Sequence[int]) -> float:
+        """Return the odds of all sets that hold none of these effects against those that hold one,
+        with the window's sets alone in question.
+        """
+        weights = {True: 0.0, False: 0.0}
+        for effects, nats in self.all_sets:
+            weights[not {*members}.isdisjoint(effects)] += float(np.exp(-nats))
+        return weights[False] / weights[True]
 
     def _named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
         """Return the verdict on a cause that the flights ask for; ``mean`` is in floors,
@@ -132,6 +154,17 @@ class Reading:
         if low <= 0.0 <= high:
             sentence = f"{finding.cause}: {finding.name} = {text}, an interval that holds 0."
             return replace(finding, verdict=result.CANDIDATE, sentence=sentence)
+        names = [self.point.problem.effects[k].name for k in members]
+        partners = tuple(name for name in names if name != finding.name)
+        odds = self._odds_of_none(members)
+        if odds > POSSIBLE:
+            which = " or ".join((finding.name, *partners))
+            sentence = (
+                f"{finding.cause}: {finding.name} = {text} if it is there; sets of causes without"
+                f" {which} explain these flights nearly as well (odds {odds:.2g})."
+            )
+            finding = replace(finding, partners=partners)
+            return replace(finding, verdict=result.CANDIDATE, sentence=sentence)
         if len(members) < 2:
             digits = 0 if finding.nats >= 10.0 else 1
             sentence = (
@@ -140,8 +173,6 @@ class Reading:
                 f" {finding.differs:.2g}."
             )
             return replace(finding, verdict=result.FOUND, sentence=sentence)
-        names = [self.point.problem.effects[k].name for k in members]
-        partners = tuple(name for name in names if name != finding.name)
         joint = self._joint(members)
         sentence = (
             f"{finding.cause}: {finding.name} = {text} if it is the cause; these flights cannot"

@@ -22,8 +22,8 @@ VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",
     CLASS: "this or one of its partners; these flights cannot tell which",
     CANDIDATE: (
-        "the flights ask for it, but held-out flights do not confirm it, or the search does not"
-        " always name it without some of them"
+        "the flights ask for it, but held-out flights do not confirm it, the search does not"
+        " always name it without some of them, or sets of causes without it are nearly as likely"
     ),
     BOUNDED: (
         "the flights do not ask for it; if it is present all the same, then within these limits,"

@@ -86,7 +86,7 @@ class Selector:
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
         self._visited = {NOTHING}
         self._settled_sets = {NOTHING}  # at which derivatives were taken, or still held
-        self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
+        self._simulated = {NOTHING: 0.0}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
         self._followed: set[Names] = set()
         self._every = False  # whether any effect may differ among flights
@@ -231,7 +231,7 @@ class Selector:
         for simulated, nats in self._simulated.items():
             if nats < -WINDOW:
                 done.add(simulated)
-            if simulated in listed:
+            if simulated in listed and simulated:  # all causes together say nothing of others
                 shortfalls[simulated ^ present] = listed[simulated] - nats
         expected = {}
         for chosen, promised in listed.items():

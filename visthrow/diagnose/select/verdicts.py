@@ -93,7 +93,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     in_units = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
-    reading = Reading(shared_point, active, withdrawn, sets, unlike)
+    reading = Reading(shared_point, active, withdrawn, sets, _all_sets(selection), unlike)
     findings = tuple(reading.finding(j) for j in range(len(model.effects)))
     named = [findings[j] for j in active]
     theta = {f.name: f.estimate for f in named}
@@ -267,6 +267,17 @@ def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
         varying = {c for c in trial.chosen if c.group != ALL}
         if varying == random and not laws_of(trial.chosen):
             sets.append((tuple(trial.columns), nats))
+    return sets
+
+
+def _all_sets(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
+    """Return the effects that each possible set holds, the same in all flights or varying among
+    them, and its nats behind.
+    """
+    sets = []
+    for trial, nats in selection.window:
+        effects = {j for c in trial.chosen if c.group != EVENT for j in c.columns}
+        sets.append((tuple(sorted(effects)), nats))
     return sets
 
 
