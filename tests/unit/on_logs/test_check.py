@@ -215,6 +215,23 @@ def test_a_late_channel_that_no_model_reads_refuses_no_log():
     assert refused_of(checked, known(None)) == ()
 
 
+def test_a_late_attitude_refuses_a_log_by_the_velocity_that_follows_its_position():
+    """No model reads the velocity, which alone is exact enough to tell the clocks apart."""
+    logs = []
+    for seed, late in ((1, 0.0), (2, 0.1)):
+        columns = flight(20.0, seed=seed)
+        time = columns["time"] + late
+        airborne = {
+            name: Channel(time, columns.pop(name), *UNITS[name])
+            for name in ("quat_wb", "rate_b", "acc_b", "command")
+        }
+        logs.append(log_of(columns, **airborne))
+    assert refused_of(check(logs), known(None)) == (1,)
+    (reason,) = contradictions(check(logs), VELOCITIES)
+    assert "d(vel_w)/dt, quat_wb acc_b: the second is +" in reason
+    assert "streams on clocks apart" in reason
+
+
 def test_a_contradiction_is_reported_before_a_model_is_built():
     columns = flight()
     columns["rate_b"] = columns["rate_b"] * 57.3

@@ -58,12 +58,26 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
     and channel; a bad row about one of them is no reason."""
     reasons = []
     for checked in results:
+        ignored = unread - _agreeing(checked, unread)
         for row in checked.rows:
             refuses = row.topic in CONTRADICT or "never overlap" in row.text
             about = {row.name, *re.findall(r"\w+", row.channel)}
-            if row.verdict == "bad" and refuses and unread.isdisjoint(about):
+            if row.verdict == "bad" and refuses and ignored.isdisjoint(about):
                 reasons.append(f"{checked.name}: {row.name}: {row.text}")
     return reasons
+
+
+def _agreeing(checked: Checked, unread: frozenset[str]) -> set[str]:
+    """Return velocities that go with a position that the model reads: what contradicts them
+    contradicts the position.
+    """
+    bad = {row.channel for row in checked.rows if row.verdict == "bad"}
+    velocities = set()
+    for channel in {row.channel for row in checked.rows} - bad:
+        pair = re.fullmatch(r"d\((\w+)\)/dt, (\w+)", channel)
+        if pair and pair[1] not in unread:
+            velocities.add(pair[2])
+    return velocities
 
 
 def copies(results: Sequence[Checked]) -> dict[int, int]:
