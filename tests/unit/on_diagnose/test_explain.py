@@ -83,3 +83,18 @@ def test_where_most_logs_are_bad_the_status_says_so(flights, tmp_path):
     status, said = explained([*map(in_millimetres, flights[:2]), flights[2]], tmp_path)
     assert (status, said["overall"]) == (REFUSED, "DATA INCONSISTENT")
     assert np.size(said["findings"]) == 0
+
+
+def test_no_earlier_answer_is_left_where_an_explanation_stops(flights, tmp_path):
+    """Neither where the logs contradict themselves, nor where a run ends without an answer."""
+    earlier = tmp_path / "diagnosis.json"
+    earlier.write_text('{"overall": "KNOWN"}')
+    names = []
+    for i, log in enumerate(map(in_millimetres, flights)):
+        names.append(str(tmp_path / f"{i}.npz"))
+        log.save(names[-1])
+    command = ["diagnose", "explain", *names, "--out", str(tmp_path), "--device", "cpu"]
+    assert cli.main(command) == REFUSED
+    assert json.loads(earlier.read_text())["overall"] == "DATA INCONSISTENT"
+    assert cli.main([*command, "--without", "0,1,2"]) == 2
+    assert not earlier.exists()

@@ -458,6 +458,19 @@ class TestImu:
             assert abs(found[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
             assert sd[name] < 0.15 * abs(size), name
 
+    def test_without_torques_the_accelerometer_alone_tells_the_motors_lag(self):
+        logs = self.logs(0.05, 0.0, (0.0, 0.0))
+        for log in logs:
+            del log.channels["rate_b"]
+        model = ImuModel(logs, replace(IMU, torque=None))
+        assert model.channels == ("acc_b",)
+        assert not {"inertia_xy", "com_x", "motor_fl"} & {e.name for e in model.effects}
+        diagnosis = diagnose_flights.diagnose(logs, model, laws=False)
+        assert diagnosis.named == ("motor_tau",)
+        assert diagnosis["motor_tau"].low < 0.02 < diagnosis["motor_tau"].high
+        names = [n for n in fitting.DEFAULT_FREE["imu"] if not n.startswith("inertia")]
+        assert list(fitting.fit(model, names).names) == names
+
     def test_a_voltage_that_only_some_logs_hold_is_not_used(self):
         logs = self.logs(0.05, 0.0, (0.0, 0.0))
         assert not ImuModel(logs, IMU).notes

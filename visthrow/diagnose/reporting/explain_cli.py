@@ -34,11 +34,12 @@ def run(args: argparse.Namespace) -> int:
     check_place(folder / DIAGNOSIS)
     opened = opening.Opened(args)
     test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
+    (folder / DIAGNOSIS).unlink(missing_ok=True)  # of earlier flights, should this run stop
     diagnosis = opened.diagnose(say=lambda line: print(line, flush=True))
     gain = None
-    if args.no_report:
+    only_json = args.no_report or diagnosis.work is None
+    if only_json:
         write_json(folder / DIAGNOSIS, report.to_json(diagnosis, extra=made_with))
-    if args.no_report or diagnosis.work is None:
         print("\n" + report.summary(diagnosis))
     else:
         limits = not args.no_blind
@@ -46,11 +47,11 @@ def run(args: argparse.Namespace) -> int:
             folder, diagnosis, opened.model, opened.logs, args.seed, limits, made_with
         )
     tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
-    if args.no_report:
+    if only_json:
         print(f"JSON: {folder / DIAGNOSIS}")
         if (folder / page.PAGE).exists():
             print(f"{folder / page.PAGE}, its pictures and recording are of an earlier diagnosis")
-    elif diagnosis.work is not None:
+    else:
         print(f"page, JSON, pictures and recording: {folder}")
     if args.json:
         extra = {**made_with, "tested": tested}

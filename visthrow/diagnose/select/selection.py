@@ -189,14 +189,14 @@ class Selector:
 
     def _keep(self, near: list[Trial]) -> None:
         """Keep the sets that are possible beside the best: trials, and those that were the best
-        before.
+        before, simulated again from where the best is.
         """
         earlier = self._visited - {self.best.chosen}
-        for chosen, nats in self._simulated.items():
-            if chosen in earlier and nats > -self._limit(chosen):
-                near.append(Trial(chosen, self.best.point, lead=nats))
+        known = [s for s in earlier if self._simulated.get(s, -np.inf) > -self._limit(s)]
+        again = self._tried(self.best.point, known)
+        near = near + [t for t in again if t.lead > -self._limit(t.chosen)]
         near.sort(key=lambda t: -t.lead)
-        self.window = [(self.best, 0.0), *((t, -t.lead) for t in near)]
+        self.window = [(self.best, 0.0), *((t, max(-t.lead, 0.0)) for t in near)]
 
     def _listed(self) -> dict[Names, float]:
         """Return sets near the best, with the nats by which they are ahead of the present one by

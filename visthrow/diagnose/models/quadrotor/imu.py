@@ -38,7 +38,8 @@ class ImuParams(QuadrotorParams):
     """
 
     input: Literal["motor_command", "motor_speed"]  # channel of the commands
-    torque: TorqueParams  # how thrusts turn the vehicle
+    # how thrusts turn the vehicle; None: rates are not simulated, and the gyro is not read
+    torque: TorqueParams | None = None
 
 
 class ImuModel(DrivenModel):
@@ -50,10 +51,12 @@ class ImuModel(DrivenModel):
     lawless = "nothing tells the attitude and the velocity that a law is made of"
 
     def describe(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
-        """See the base class; the gyro is left out where the motors do not tell what turns the
-        vehicle.
+        """See the base class; the gyro is left out where the setup states no torques, or where the
+        motors do not tell what turns the vehicle.
         """
-        self.needed = (params.input, *CHANNELS)
+        if params.torque is None:
+            self.channels = CHANNELS[:1]
+        self.needed = (params.input, *self.channels)
         self.inputs = (params.input, *in_all(logs, "battery_voltage"))
         turned = [r for log in logs if (r := _turned(log, params)) is not None]
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
@@ -64,10 +67,11 @@ class ImuModel(DrivenModel):
         """See the base class."""
         p = self.params
         stretches = []
-        for start, (force, gyro), data in cut_flying(log, p, CHANNELS, self.needed):
+        for start, (force, *gyro), data in cut_flying(log, p, self.channels, self.needed):
             time, acc, noise = force
-            tables = [(time, acc[:, 2:], noise[2:]), gyro][: len(self.channels)]
-            begin = [*gyro[1][0], 0.0], [1.0, 1.0, 1.0, OFFSET]
+            tables = [(time, acc[:, 2:], noise[2:]), *gyro]
+            rates = gyro[0][1][0] if gyro else np.zeros(3)
+            begin = [*rates, 0.0], [1.0, 1.0, 1.0, OFFSET]
             span = start, start + p.window
             stretches.append(self.lay_out(number, "flight", tables, span, data, *begin))
         return stretches
@@ -82,13 +86,13 @@ class ImuModel(DrivenModel):
         """
         thrust = self.thrusts(lanes, self.steps)
         pushes = self.pushes_at(lanes, halves(self.steps))
-        turning = self._turning(lanes, thrust)
-
-        def slope(half: int, rate: ndarray) -> ndarray:
-            return turning(half, rate, pushes[half, :, -3:])
-
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
         if "rate_b" in self.channels:
+            turning = self._turning(lanes, thrust)
+
+            def slope(half: int, rate: ndarray) -> ndarray:
+                return turning(half, rate, pushes[half, :, -3:])
+
             rates = integrate(slope, lanes.nuisance[:, :3], self.steps, self.params.step)
         gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
@@ -126,9 +130,9 @@ class ImuModel(DrivenModel):
 
 def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
     """Relate the angular acceleration to what the commands' torques would give; None where a
-    channel lacks or nothing turns.
+    channel lacks, nothing turns, or the setup states no torques.
     """
-    if params.input not in log or "rate_b" not in log:
+    if params.torque is None or params.input not in log or "rate_b" not in log:
         return None
     time, inputs = log[params.input].samples()
     sent = params.torque.of(params.thrust(inputs)) / params.torque.inertia
