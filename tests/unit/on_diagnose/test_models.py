@@ -178,6 +178,14 @@ class TestStand:
 
 
 class TestFlyer:
+    def test_an_attitude_on_another_clock_is_found_in_short_flights(self):
+        """Twelve hundredths of a second, without an accelerometer that tells them before."""
+        logs = [fly(4.0, late=0.12, seed=seed) for seed in range(3)]
+        diagnosis = diagnose_flights.diagnose(logs, FlyerModel(logs, LATE_FLYER), laws=False)
+        assert diagnosis.named == ("attitude_delay",)
+        assert diagnosis["attitude_delay"].verdict == result.FOUND
+        assert diagnosis.theta["attitude_delay"] == approx(0.12, abs=2e-3)
+
     @mark.parametrize("params", [FLYER, IMU], ids=["flyer", "imu"])
     @mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
     def test_a_map_without_thrust_is_refused(self, params, thrust_map):
