@@ -6,8 +6,8 @@ import numpy as np
 
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import correlated_of, gram_of
-from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import Model
 
 
@@ -29,7 +29,7 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     squares = []
     for windows, grams in zip(told, raw):
         shaped = correlated_of(grams, windows, noise.correlation_time)
-        statistics = integrals(shaped, noise).statistics(shaped, np.zeros(len(priors.floor)))
+        statistics = Integrals(shaped, noise).statistics(shaped, np.zeros(len(priors.floor)))
         squares.append(statistics.square.sum())
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(
         len(w.residual) for w in told[-1]

@@ -14,7 +14,8 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
-from visthrow.diagnose.likelihood.stack import Integrals, Stack, integrals
+from visthrow.diagnose.likelihood.integrals import Integrals
+from visthrow.diagnose.likelihood.integrals import fitted as fitted_windows
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 EFFECTS = catalogue(6)
@@ -27,8 +28,8 @@ def likelihood(gram, levels, window):
 
 def alone(gram, levels, window):
     """What a window says by itself."""
-    integrals = Integrals(Stack([gram], windows=[window]), [gram], levels)
-    return integrals.statistics([gram], np.zeros(0))
+    levels = replace(levels, share=levels.share[[window]])
+    return Integrals([gram], levels).statistics([gram], np.zeros(0))
 
 
 @fixture(scope="module")
@@ -56,7 +57,7 @@ def dense(window, gram, levels, floors, at):
 def test_information_and_score_are_those_of_the_dense_covariance(fitted):
     _, windows, floors, levels, grams = fitted
     extended = [marginal.with_latent_effects(gram) for gram in grams]
-    part = integrals(extended, levels).statistics(extended, np.zeros(len(EFFECTS)))
+    part = Integrals(extended, levels).statistics(extended, np.zeros(len(EFFECTS)))
     for at in (0, 7):
         v, s = dense(windows[at], grams[at], levels, floors, at)
         inverse = np.linalg.inv(v)
@@ -103,7 +104,7 @@ def test_broken_derivatives_are_reported_with_their_window(fitted):
         DiagnoseError,
         match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular",
     ):
-        Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).fitted(fitted[3])
+        fitted_windows([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)], fitted[3])
 
 
 @mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from numpy import ndarray
 from scipy.linalg import lapack
-from scipy.sparse import bsr_array, csr_array
 
+from visthrow.diagnose.likelihood.integrals import fitted, look
 from visthrow.diagnose.likelihood.marginal import (
     TAIL,
     Gram,
@@ -24,7 +24,6 @@ from visthrow.diagnose.likelihood.marginal import (
     residual_after_fit,
     without_effects,
 )
-from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
@@ -154,9 +153,8 @@ class _Layout:
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
     phases: ndarray  # number of the level that each share is of, shape (W B,)
-    # 1 where a parameter moves a window's own level of a block, or scale of a channel; shape
-    # (P, W (B + C))
-    moves: csr_array
+    # numbers of what moves each window: its phase's levels, scales, and shares, shape (W, 2 B + C)
+    places: ndarray
 
     @staticmethod
     def numbered(grams: Sequence[Gram], noise: Noise) -> "_Layout":
@@ -167,15 +165,13 @@ class _Layout:
         pairs = [(block, gram.phase) for gram in grams for block in range(blocks)]
         phases = np.array([number.get(pair, 0) for pair in pairs], dtype=int)
         shares = len(keys) + np.arange(len(phases))
-        first_scale = len(keys) + len(phases)
-        scales = np.tile(first_scale + np.arange(len(noise.scale)), (windows, 1))
-        moved = np.hstack((phases.reshape(windows, -1), scales))
-        places = np.arange(moved.size).reshape(moved.shape)
-        parameters = np.concatenate((moved.ravel(), shares))
-        places = np.concatenate((places.ravel(), places[:, :blocks].ravel()))
-        shape = first_scale + len(noise.scale), moved.size
-        moves = csr_array((np.ones(len(places)), (parameters, places)), shape=shape)
-        return _Layout(keys, phases, moves)
+        scales = shares[-1] + 1 + np.arange(len(noise.scale))
+        parts = (
+            phases.reshape(windows, -1),
+            np.tile(scales, (windows, 1)),
+            shares.reshape(windows, -1),
+        )
+        return _Layout(keys, phases, np.hstack(parts))
 
     @property
     def shares(self) -> slice:
@@ -218,20 +214,16 @@ def maximised(
     all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
     promises less is the last."""
     layout = _Layout.numbered(grams, noise)
-    stack = Stack(grams)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
-
-    def look(x: ndarray) -> tuple[float, ndarray, ndarray]:
-        return _likelihood(stack, layout.unpack(x, noise), layout)
-
-    value, slope, curvature = look(x)
+    value, slope, curvature = _likelihood(grams, layout.unpack(x, noise), layout)
     for _ in range(ITERATIONS):
         step, promised = _scoring_step(layout, x, slope, curvature, low, high)
         if promised < tolerance:  # it is taken without another look
             return layout.unpack(x + step, noise), value + 0.5 * promised
         for _ in range(HALVINGS):
-            tried, its_slope, expected = look(x + step)
+            levels = layout.unpack(x + step, noise)
+            tried, its_slope, expected = _likelihood(grams, levels, layout)
             if tried > value:
                 break
             step = step / 3.0
@@ -290,15 +282,21 @@ def _logarithms(step: ndarray) -> ndarray:
     return 0.5 * np.log1p(np.maximum(2.0 * step, np.expm1(-2.0 * LONGEST_FALL)))
 
 
-def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, ndarray, ndarray]:
+def _likelihood(
+    grams: Sequence[Gram], noise: Noise, layout: _Layout
+) -> tuple[float, ndarray, ndarray]:
     """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
     expected curvature.
     """
-    values, slopes, curvatures = stack.look(noise)
-    windows = np.arange(len(curvatures) + 1)
-    curved = bsr_array((curvatures, windows[:-1], windows))
-    slope = layout.moves @ slopes.ravel()
-    curvature = (layout.moves @ curved @ layout.moves.T).toarray()
+    values, slopes, curvatures = look(grams, noise)
+    places = layout.places
+    # a share moves a window as its phase's level does
+    moved = np.r_[: slopes.shape[1], : noise.share.shape[1]]
+    slope = np.zeros(places.max() + 1)
+    np.add.at(slope, places, slopes[:, moved])
+    curvature = np.zeros((len(slope), len(slope)))
+    pairs = places[:, :, None], places[:, None]
+    np.add.at(curvature, pairs, curvatures[:, moved[:, None], moved])
     inverse = noise.share.ravel() ** -2.0
     slope[layout.shares] += TAIL * (inverse - 1.0)
     diagonal = np.einsum("ii->i", curvature)  # a view
@@ -345,7 +343,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarr
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
-    fits, _ = Stack(shaped).fitted(noise)
+    fits, _ = fitted(shaped, noise)
     for fit, gram in zip(fits, shaped):
         latents = fit[gram.nuisances :]
         fit[gram.nuisances :] = gram.factor @ latents

@@ -14,8 +14,8 @@ import numpy as np
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
 from visthrow.diagnose.likelihood.evidence import FEWEST, STRONG, Posterior, Priors
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
-from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
@@ -255,7 +255,7 @@ def expected_information(
         share=np.ones((len(windows), len(LATENT_BLOCKS))),
     )
     flown_theta = np.zeros(len(floors))
-    information = integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
+    information = Integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
     # both catalogues name the same effects, each in floors of its own
     places = np.zeros((len(names), len(floors)))
     for i, name in enumerate(names):

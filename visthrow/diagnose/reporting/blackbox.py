@@ -13,8 +13,8 @@ from scipy.linalg import solve_triangular
 
 from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.likelihood import grammar
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import with_latent_effects
-from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
@@ -120,7 +120,7 @@ def train(
     information = np.zeros((len(names), size, size))
     score = np.zeros((len(names), size))
     grams = [with_latent_effects(gram) for gram in point.grams]
-    parts = integrals(grams, point.noise).statistics(grams, point.theta)
+    parts = Integrals(grams, point.noise).statistics(grams, point.theta)
     count = len(point.theta)
     sizes = np.zeros(len(parts.theta))
     sizes[:count] = 0.0 if theta is None else theta

@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import unit_of
-from visthrow.diagnose.likelihood.marginal import Noise
-from visthrow.diagnose.likelihood.stack import Stack
+from visthrow.diagnose.likelihood.integrals import fitted
+from visthrow.diagnose.likelihood.marginal import Gram, Noise
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Level
@@ -36,19 +36,19 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     many, one is higher by chance."""
     noise = after.noise
     threshold = threshold + np.log(max(len(noise.latent_sd), 1))
-    stacks = {phase: _stack_of(after, phase) for _, phase in noise.latent_sd}
-    limits = {key: _upper_limit(stacks[key[1]], noise, key) for key in noise.latent_sd}
+    parts = {phase: _in_phase(after, phase) for _, phase in noise.latent_sd}
+    limits = {key: _upper_limit(*parts[key[1]], key) for key in noise.latent_sd}
     floors = floors_of(after)
     listed = []
     for key in sorted(limits, key=lambda key: key[0]):
         block, phase = key
         level = noise.latent_sd[key]
-        stack = stacks[phase]
+        part = parts[phase]
         quiet = min(limit for (b, _), limit in limits.items() if b == block)
         most = max(UNKNOWN_RATIO * quiet, floors.get(key, 0.0))
         nats = 0.0
         if level > most:
-            nats = _likelihood(stack, noise, key, level) - _likelihood(stack, noise, key, most)
+            nats = _likelihood(*part, key, level) - _likelihood(*part, key, most)
         earlier = before.noise.latent_sd.get(key, float("nan"))
         name = LATENT_BLOCKS[block]
         excessive = bool(nats > threshold)
@@ -88,24 +88,25 @@ def positions_of(point: Point) -> list[int]:
     return [c for c, name in enumerate(channels) if unit_of(name) == "m"]
 
 
-def _stack_of(point: Point, phase: str) -> Stack:
-    """Return the windows of a phase side by side."""
+def _in_phase(point: Point, phase: str) -> tuple[list[Gram], Noise]:
+    """Return the windows of a phase, and the levels with the shares of these."""
     windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-    return Stack([point.grams[w] for w in windows], windows)
+    noise = replace(point.noise, share=point.noise.share[windows])
+    return [point.grams[w] for w in windows], noise
 
 
-def _likelihood(stack: Stack, noise: Noise, key: tuple[int, str], level: float) -> float:
+def _likelihood(grams: Sequence[Gram], noise: Noise, key: tuple[int, str], level: float) -> float:
     """Return the log likelihood of a phase's residuals under a level of a block and phase."""
     tried = replace(noise, latent_sd={**noise.latent_sd, key: level})
-    return float(stack.fitted(tried)[1].sum())
+    return float(fitted(grams, tried)[1].sum())
 
 
-def _upper_limit(stack: Stack, noise: Noise, key: tuple[int, str]) -> float:
+def _upper_limit(grams: Sequence[Gram], noise: Noise, key: tuple[int, str]) -> float:
     """Return the largest level of a block that a phase's residuals allow, one-sided 97.5 %."""
     best = noise.latent_sd[key]
-    least = _likelihood(stack, noise, key, best) - 0.5 * NORMAL_95**2
+    least = _likelihood(grams, noise, key, best) - 0.5 * NORMAL_95**2
     for step in range(1, MOST_STEPS):
-        if _likelihood(stack, noise, key, best * STEP**step) < least:
+        if _likelihood(grams, noise, key, best * STEP**step) < least:
             break
     return float(best * STEP**step)
 

@@ -18,9 +18,9 @@ from scipy.special import betaincinv
 
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
-from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import few_of
 from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import Statistics, correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point
@@ -66,7 +66,7 @@ def statistics_of(
     grams = grams_of(wide, floors, len(problem.model.channels))
     grams = correlated_of(grams, wide, point.noise.correlation_time)
     noise = levels.only(point.noise, grams, rows)
-    return stack.integrals(grams, noise).statistics(grams, point.theta)
+    return Integrals(grams, noise).statistics(grams, point.theta)
 
 
 def _evidence(

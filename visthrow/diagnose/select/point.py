@@ -11,7 +11,6 @@ import numpy as np
 from numpy import ndarray
 
 from visthrow.diagnose.likelihood import noise_levels as levels
-from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
@@ -22,6 +21,7 @@ from visthrow.diagnose.likelihood.evidence import (
     Priors,
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
@@ -132,7 +132,7 @@ class Point:
     noise: Noise
     plain: Statistics  # of flights without anything of their own
     shares: Shares  # of effects that differ from flight to flight, or from day to day
-    integrals: stack.Integrals  # of the grams under these noise levels
+    integrals: Integrals  # of the grams under these noise levels
     about: Linearised  # where the model's derivatives were taken
     commands: Sequence[
         ndarray
@@ -173,19 +173,19 @@ class Point:
         return self.posterior.log_evidence(active) - misfit + self.noise.log_prior
 
 
-def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
+def regathered(point: Point, integrals: Integrals | None = None, **changes: Any) -> Point:
     """The point with changes, and what its windows then say.
 
     ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of
     the point."""
     changed = replace(point, **changes)
     if integrals is None:
-        integrals = stack.integrals(changed.grams, changed.noise)
+        integrals = Integrals(changed.grams, changed.noise)
     plain = _by_flight(integrals, changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
 
 
-def _by_flight(integrals: stack.Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
+def _by_flight(integrals: Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
     statistics = integrals.statistics(grams, theta)
     return statistics.by(statistics.flights)
 
@@ -216,7 +216,7 @@ def linearise(
         extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     cleaned, raw = _cleaned(problem, extended)
     noise, grams = levels.fit(cleaned, raw, start)
-    integrals = stack.integrals(grams, noise)
+    integrals = Integrals(grams, noise)
     plain = cleaned
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]

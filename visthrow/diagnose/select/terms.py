@@ -17,13 +17,13 @@ from scipy.linalg import solve_triangular
 
 from visthrow.diagnose.likelihood.evidence import STRONG, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
+from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import (
     Statistics,
     correlated_of,
     grams_of,
     with_latent_effects,
 )
-from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import (
     JOINT,
@@ -115,7 +115,7 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
     extended = parallel_map(with_latent_effects, grams)
-    parts = integrals(extended, noise).statistics(extended, point.theta)
+    parts = Integrals(extended, noise).statistics(extended, point.theta)
     plain = parts.first(len(point.theta)).by(parts.flights)
     return replace(point, noise=noise, grams=grams, plain=plain, shares={}), parts
 

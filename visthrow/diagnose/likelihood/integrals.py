@@ -1,0 +1,192 @@
+"""Initial states and latent forces of windows, fitted or integrated out at some noise levels: the
+formulas of :mod:`visthrow.diagnose.likelihood.marginal`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy import ndarray
+from scipy.linalg import lapack
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood.marginal import (
+    Gram,
+    Noise,
+    Statistics,
+    without_rounding,
+)
+from visthrow.diagnose.likelihood.threads import parallel_map
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
+
+# relative growth of the normal equations' diagonal where they are positive definite but for
+# rounding
+ROUNDING = 1e-10
+
+BLOCKS = len(LATENT_BLOCKS)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """A window at some noise levels, whatever its residuals are; it has n columns [X, G]."""
+
+    weight: ndarray  # of the channels, shape (C,)
+    level: ndarray  # prior deviation of the columns, shape (n,)
+    # inverse of the lower Cholesky factor L of 1 + P^1/2 U' W U P^1/2, shape (n, n)
+    root: ndarray
+    log_det: float  # of V
+
+    def projected(self, gram: Gram) -> ndarray:
+        """Return L^-1 P^1/2 U' W r of a window's residuals, shape (n,)."""
+        cross = self.weight @ gram.cross[:, : gram.hidden]
+        part: ndarray = self.root @ (self.level * cross)
+        return part
+
+    def square(self, gram: Gram) -> float:
+        """Return r' V^-1 r + log det V of a window's residuals."""
+        explained = np.square(self.projected(gram)).sum()
+        return float(self.weight @ gram.square - explained + self.log_det)
+
+
+def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]:
+    """Fit the initial states and latent forces of windows.
+
+    ``noise``: whose shares are those of these windows. Returns the most probable initial state and
+    unit latent forces of each, shape (D + L,), and the log-likelihood of its residuals, but for the
+    powers of 2 pi, shape (W,).
+
+    Raises DiagnoseError: the normal equations are not positive definite, which only broken
+    derivatives can cause."""
+
+    fits = []
+    values = []
+    for gram, shape in zip(grams, _shapes(grams, noise)):
+        fits.append(shape.level * (shape.root.T @ shape.projected(gram)))
+        values.append(-0.5 * shape.square(gram))
+    return fits, np.array(values)
+
+
+def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray]:
+    """Return the log-likelihood of windows, its gradient and expected curvature by the logarithms
+    of the windows' own levels.
+
+    Raises DiagnoseError: as :func:`fitted`. Returns values (W,); gradients (W, B + C) by the B
+    blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales
+    share with the fitted columns is given to the channels by their part in them."""
+
+    parts = parallel_map(_looked, grams, _shapes(grams, noise))
+    return tuple(map(np.array, zip(*parts)))
+
+
+def _shapes(grams: Sequence[Gram], noise: Noise) -> list[_Shape]:
+    """Factorise the normal equations of windows."""
+    return parallel_map(partial(_shape, noise=noise), grams, noise.share)
+
+
+def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:
+    """Factorise a window's normal equations; ``share``: of its phase's levels, shape (B,)."""
+    levels = [noise.latent_sd.get((block, gram.phase), 0.0) for block in range(BLOCKS)]
+    of_latents = (levels * share)[gram.latent_block]
+    level = np.append(np.ones(gram.nuisances), of_latents)
+    weight = noise.scale**-2.0
+    normal = np.einsum("c,cij->ij", weight, _inner(gram)) * np.outer(level, level)
+    factor = _factor(normal + np.eye(len(level)), gram)
+    log_diagonal = np.log(np.diag(factor)).sum()
+    log_det = 2.0 * (log_diagonal + gram.log_sigma + gram.count @ np.log(noise.scale))
+    return _Shape(weight, level, lapack.dtrtri(factor, lower=1)[0], log_det)
+
+
+def _inner(gram: Gram) -> ndarray:
+    """Return the inner products of what is integrated out, shape (C, n, n)."""
+    return gram.inner[:, : gram.hidden, : gram.hidden]
+
+
+def _factor(normal: ndarray, gram: Gram) -> ndarray:
+    """Return the lower Cholesky factor of a window's normal equations.
+
+    Levels of many orders of magnitude, as a search for them may try, leave the identity below
+    rounding: then the diagonal grows a little."""
+    for growth in (0.0, ROUNDING):
+        try:
+            return np.linalg.cholesky(normal + growth * np.diag(np.diag(normal)))
+        except np.linalg.LinAlgError:
+            continue
+    where = f"window of flight {gram.flight}, phase {gram.phase}"
+    raise DiagnoseError(f"{where}: the normal equations are singular")
+
+
+def _looked(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
+    """Return value, gradient and curvature by [blocks, scales]."""
+    inner = _inner(gram)
+    covariance = shape.root.T @ shape.root
+    variance = np.diag(covariance)
+    # what the posterior variances of [b, a] leave of each channel's squares
+    spread = np.einsum("cij,ij->c", inner, covariance * np.outer(shape.level, shape.level))
+    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
+    # kept from taking others.
+    taken = np.clip(shape.weight * spread, 0.0, gram.count)
+    in_blocks = np.zeros((BLOCKS, len(variance)))
+    in_blocks[gram.latent_block, np.arange(gram.nuisances, gram.hidden)] = 1.0
+    mean = shape.root.T @ shape.projected(gram)
+    moved = shape.level * mean
+    bent = inner @ moved @ moved
+    square = gram.square - 2.0 * gram.cross[:, : gram.hidden] @ moved + bent + spread
+    by_block = in_blocks @ (variance + mean**2 - 1.0)
+    gradient = np.append(by_block, square * shape.weight - gram.count)
+    squared = np.square(covariance)
+    shared = in_blocks @ (variance - squared.sum(1))
+    np.fill_diagonal(squared, (1.0 - variance) ** 2)
+    part = taken / max(taken.sum(), 1e-300)
+    curvature = np.diag(np.append(np.zeros(BLOCKS), 2.0 * (gram.count - taken)))
+    curvature[:BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ in_blocks.T
+    curvature[:BLOCKS, BLOCKS:] = 2.0 * np.outer(shared, part)
+    curvature[BLOCKS:, :BLOCKS] = curvature[:BLOCKS, BLOCKS:].T
+    return -0.5 * shape.square(gram), gradient, curvature
+
+
+class Integrals:
+    """The part of windows' statistics that no residual changes."""
+
+    def __init__(self, grams: Sequence[Gram], noise: Noise):
+        """Integrate initial states and latent forces out; ``noise``: as of :func:`fitted`.
+
+        Raises DiagnoseError: as :func:`fitted`; information came out negative beyond rounding."""
+        self._shapes = _shapes(grams, noise)
+        # L^-1 P^1/2 U' W S of each window, shape (n, K)
+        self._halves = parallel_map(_half, grams, self._shapes)
+        count = max(half.shape[1] for half in self._halves)
+        # of windows with fewer effects, the last are 0
+        information = np.zeros((len(grams), count, count))
+        for row, gram, shape, half in zip(information, grams, self._shapes, self._halves):
+            effects = gram.inner[:, gram.hidden :, gram.hidden :]
+            reduced = np.einsum("c,cij->ij", shape.weight, effects) - half.T @ half
+            row[: len(reduced), : len(reduced)] = 0.5 * (reduced + reduced.T)
+        self._information = without_rounding(information, grams)
+        self._flights = np.array([gram.flight for gram in grams])
+        self._samples = np.array([gram.count.sum() for gram in grams])
+
+    @property
+    def log_dets(self) -> ndarray:
+        """Return the log determinant of each window's V, shape (W,)."""
+        return np.array([shape.log_det for shape in self._shapes])
+
+    def statistics(self, grams: Sequence[Gram], theta: ndarray) -> Statistics:
+        """Return the statistics of windows with the residuals of grams of the same derivatives.
+
+        ``theta``: where these residuals are, in floors; the sizes of further effects are 0."""
+        score = np.zeros(self._information.shape[:2])
+        for row, gram, shape, half in zip(score, grams, self._shapes, self._halves):
+            effects = shape.weight @ gram.cross[:, gram.hidden :]
+            row[: len(effects)] = effects - half.T @ shape.projected(gram)
+        score[:, np.diagonal(self._information.sum(0)) == 0.0] = 0.0
+        square = np.array([shape.square(gram) for gram, shape in zip(grams, self._shapes)])
+        sizes = np.zeros(score.shape[1])
+        sizes[: len(theta)] = theta
+        return Statistics(self._flights, self._information, score, square, self._samples, sizes)
+
+
+def _half(gram: Gram, shape: _Shape) -> ndarray:
+    """Return what a window's effects share with what is integrated out, shape (n, K)."""
+    right = gram.inner[:, : gram.hidden, gram.hidden :]
+    return shape.root @ (shape.level[:, None] * np.einsum("c,cij->ij", shape.weight, right))
