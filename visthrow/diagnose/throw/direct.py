@@ -5,9 +5,9 @@ Each kind predicts its samples from what motion capture saw, taken back through 
 delays, frame and markers, so that it depends on sensors, camera and landing plane alone. Its
 samples stand behind the simulated ones of their window."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Protocol
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray
@@ -48,36 +48,37 @@ ACTS_ON = (
 """Numbers that nothing but these samples depends on: their effects need no simulation."""
 
 
-class DirectMeasurement(Protocol):
-    """Samples of one channel in some windows."""
+@dataclass(frozen=True)
+class DirectSamples:
+    """Samples of one channel in one window, N of them."""
 
     channel: str
-    windows: Mapping[int, Any]  # by their numbers, those that have samples
-
-    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
-        """Stamps [s], values and sigma of a window, shape (N,), (N,), ()."""
-        ...
-
-    def predicted(self, window: int, setting: Setting) -> ndarray:
-        """Return the measurement in a setting, shape (N,)."""
-        ...
-
-    def differs(self, setting: Setting, second: Setting) -> bool:
-        """Whether the measurement may differ between two settings."""
-        ...
+    time: ndarray  # stamps [s], shape (N,)
+    values: ndarray  # shape (N,)
+    sigma: float
+    predicted: Callable[[Setting], ndarray]  # what a setting makes of them, shape (N,)
 
 
-def direct_measurements(
+def direct_samples(
     logs: Sequence[FlightLog],
     flights: Sequence[RecordedFlight],
     cuts: Sequence[Cut],
     setting: Setting,
-) -> list[DirectMeasurement]:
-    """All that the logs hold of windows that count."""
-    kinds: list[DirectMeasurement] = [LandingHeight(flights, cuts)]
-    if setting.camera is not None:
-        kinds.append(CameraView(logs, flights, cuts, setting))
-    return [kind for kind in kinds if kind.windows]
+) -> dict[int, list[DirectSamples]]:
+    """Return all that the logs hold of windows that count, by the windows' numbers.
+
+    ``flights``: the logs as the replay takes them; ``setting``: the diagnosed one."""
+    counting = [(w, c) for w, c in enumerate(cuts) if c.retained]
+    last = {c.flight: w for w, c in counting}
+    by_window = defaultdict(list)
+    for n, flight in enumerate(flights):
+        if flight.landing_point is not None and flight.latch != NEVER and n in last:
+            by_window[last[n]].append(_landing(flight.landing, flight.landing_point))
+    for w, c in counting if setting.camera is not None else ():
+        flight = flights[c.flight]
+        if flight.payload is not None and seen_by_camera(logs[c.flight]):
+            by_window[w] += _camera_view(logs[c.flight], flight, c, setting)
+    return by_window
 
 
 def needs_no_flight(e: SettingEffect) -> bool:
@@ -97,8 +98,7 @@ def seen_by_camera(log: FlightLog) -> bool:
 
 def with_direct(
     window: Window,
-    number: int,
-    kinds: Sequence[DirectMeasurement],
+    listed: Sequence[DirectSamples],
     channels: Sequence[str],
     settings: Sequence[Setting],
     steps: ndarray,
@@ -107,29 +107,26 @@ def with_direct(
 
     Args:
         window: with a column for every effect.
-        kinds: of direct measurements.
+        listed: its direct measurements.
         settings: the one that is linearised about, then one for each effect, a step away.
         steps: of the effects, 0 for those without a derivative here, shape (K,).
     """
     nominal, *perturbed = settings
-    for kind in kinds:
-        if number not in kind.windows:
-            continue
-        time, values, sigma = kind.samples(number)
-        plain = kind.predicted(number, nominal)
-        count = len(time)
+    for direct in listed:
+        plain = direct.predicted(nominal)
+        count = len(plain)
         columns = np.zeros((count, len(steps)))
         for k in np.flatnonzero(steps):
-            if kind.differs(nominal, perturbed[k]):
-                columns[:, k] = (kind.predicted(number, perturbed[k]) - plain) / steps[k]
-        channel = channels.index(kind.channel)
+            if not _seen_alike(nominal, perturbed[k]):
+                columns[:, k] = (direct.predicted(perturbed[k]) - plain) / steps[k]
+        channel = channels.index(direct.channel)
         padding = (0, count), (0, 0)
         window = replace(
             window,
-            time=np.append(window.time, time),
-            residual=np.append(window.residual, values - plain),
+            time=np.append(window.time, direct.time),
+            residual=np.append(window.residual, direct.values - plain),
             channel=np.append(window.channel, [channel] * count),
-            sigma=np.append(window.sigma, [sigma] * count),
+            sigma=np.append(window.sigma, [direct.sigma] * count),
             effects=np.vstack((window.effects, columns)),
             nuisance=np.pad(window.nuisance, padding),
             latent=np.pad(window.latent, padding),
@@ -137,91 +134,58 @@ def with_direct(
     return window
 
 
-class LandingHeight:
-    """Height at which the payload's centre was when it came down [m]: one sample of a throw."""
+def _seen_alike(a: Setting, b: Setting) -> bool:
+    """Whether direct measurements are the same in two settings; the poses are measured ones."""
+    height = a.plant.release.landing_height
+    other_height = b.plant.release.landing_height
+    return (a.sensing, a.camera, height) == (b.sensing, b.camera, other_height)
 
-    channel = LANDING
 
-    def __init__(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]):
-        """Give each landing to the last window of its flight that counts."""
-        self.windows: dict[int, tuple[float, ndarray]] = {}
-        for n, flight in enumerate(flights):
-            windows = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
-            if flight.landing_point is not None and flight.latch != NEVER and windows:
-                self.windows[windows[-1]] = flight.landing, flight.landing_point
+def _landing(time: float, point_w: ndarray) -> DirectSamples:
+    """Return the height at which the payload's centre was when it came down [m]: one sample of a
+    throw.
+    """
 
-    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
-        """See :class:`DirectMeasurement`."""
-        time, point = self.windows[window]
-        return np.array([time]), point[2:], LANDING_SIGMA
-
-    def predicted(self, window: int, setting: Setting) -> ndarray:
-        """See :class:`DirectMeasurement`."""
+    def predicted(setting: Setting) -> ndarray:
         x = setting.sensing
-        point = without_frame(x, self.windows[window][1])
+        point = without_frame(x, point_w)
         point[2] = setting.plant.release.landing_height + x.payload_offset[2]
         return (1.0 + x.scale) * Rotation.from_rotvec(x.frame_tilt).apply(point)[2:]
 
-    def differs(self, setting: Setting, second: Setting) -> bool:
-        """See :class:`DirectMeasurement`."""
-        return True
+    return DirectSamples(LANDING, np.array([time]), point_w[2:], LANDING_SIGMA, predicted)
 
 
-class CameraView:
-    """Keypoints that a camera saw, normalised: payload's box, and the goal's corners where the log
-    knows the goal.
+def _camera_view(
+    log: FlightLog, flight: RecordedFlight, c: Cut, nominal: Setting
+) -> list[DirectSamples]:
+    """Return the keypoints that a camera saw in a window, normalised: payload's box, and the goal's
+    corners where the log knows the goal; none without enough of them.
     """
+    view = _view(log, flight, c, nominal.sensing)
+    if view is None:
+        return []
+    time, points, valid = view["time"], view["points"], view["valid"]
 
-    channel = KEYPOINTS
-
-    def __init__(
-        self,
-        logs: Sequence[FlightLog],
-        flights: Sequence[RecordedFlight],
-        cuts: Sequence[Cut],
-        setting: Setting,
-    ):
-        """Smooth the poses about each view.
-
-        ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the
-        diagnosed one."""
-        self._nominal = setting
-        self.windows = {}
-        for w, c in enumerate(cuts):
-            log = logs[c.flight]
-            flight = flights[c.flight]
-            if c.retained and flight.payload is not None and seen_by_camera(log):
-                view = _view(log, flight, c, setting.sensing)
-                if view is not None:
-                    self.windows[w] = view
-
-    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
-        """See :class:`DirectMeasurement`."""
-        view = self.windows[window]
-        time = np.broadcast_to(view["time"][:, None, None], view["points"].shape)
-        return time[view["valid"]].ravel(), view["points"][view["valid"]].ravel(), view["sigma"]
-
-    def predicted(self, window: int, setting: Setting) -> ndarray:
-        """See :class:`DirectMeasurement`; NaN where the lens is none."""
-        view = self.windows[window]
+    def predicted(setting: Setting) -> ndarray:
+        """Return the keypoints' prediction; NaN where the lens is none."""
         x = setting.sensing
         try:
-            lens = self._nominal.camera
-            row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
+            lens = nominal.camera
+            row = lens.fisheye.cy + points[..., 1] * _reach(lens)[1]
             middle = row.mean(axis=1)
-            time = view["time"] - x.camera_delay + x.camera_line_time * middle
-            points = _visible_keypoints(view, setting, self._nominal, time)
+            exposed = time - x.camera_delay + x.camera_line_time * middle
+            seen = _visible_keypoints(view, setting, nominal, exposed)
             if x.camera_line_time != 0.0:
-                later = _visible_keypoints(view, setting, self._nominal, time + SHORT)
+                later = _visible_keypoints(view, setting, nominal, exposed + SHORT)
                 after = x.camera_line_time * (row - middle[:, None])
-                points = points + (later - points) / SHORT * after[..., None]
+                seen = seen + (later - seen) / SHORT * after[..., None]
         except ValueError:
-            return np.full(np.count_nonzero(view["valid"]), np.nan)
-        return points[view["valid"]].ravel()
+            return np.full(np.count_nonzero(valid), np.nan)
+        return seen[valid].ravel()
 
-    def differs(self, setting: Setting, second: Setting) -> bool:
-        """See :class:`DirectMeasurement`; the poses are measured ones."""
-        return (setting.sensing, setting.camera) != (second.sensing, second.camera)
+    stamps = np.broadcast_to(time[:, None, None], points.shape)[valid]
+    sigma = max(_noise(points, valid), LEAST_KEYPOINT_SIGMA)
+    return [DirectSamples(KEYPOINTS, stamps, points[valid], sigma, predicted)]
 
 
 def _reach(camera) -> ndarray:
@@ -275,7 +239,6 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         "points": points,
         "valid": visible,
         "goal": np.asarray(goal, dtype=float)[:3],
-        "sigma": max(_noise(points, visible), LEAST_KEYPOINT_SIGMA),
     }
 
 

@@ -21,7 +21,7 @@ from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import (
-    direct_measurements,
+    direct_samples,
     needs_no_flight,
     with_direct,
 )
@@ -101,8 +101,9 @@ class ThrowModel(Model):
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
-        self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
-        self.channels = [*_measured(flights, any(hangs)), *(kind.channel for kind in self._direct)]
+        self._direct = direct_samples(logs, flights, self.flights.cuts, self.setting)
+        direct = dict.fromkeys(d.channel for listed in self._direct.values() for d in listed)
+        self.channels = [*_measured(flights, any(hangs)), *direct]
         thrown = any(f.latch != NEVER for f in flights)
         silent = sum(f.voltage is None for f in flights)
         self.has_voltage = silent < len(flights)  # whether any log holds the battery's voltage
@@ -199,7 +200,8 @@ class ThrowModel(Model):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         whole = []
         for w, window in zip(self._retained, self._with_switches(theta, listed)):
-            whole.append(with_direct(window, w, self._direct, self.channels, settings, steps))
+            direct = self._direct.get(w, ())
+            whole.append(with_direct(window, direct, self.channels, settings, steps))
         return whole
 
     def _with_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
@@ -250,11 +252,8 @@ class ThrowModel(Model):
         flown = self._flown(setting, states)
         residuals = []
         for i, (w, residual) in enumerate(zip(self._retained, flown)):
-            parts = [residual]
-            for kind in self._direct:
-                if w in kind.windows:
-                    parts.append(kind.samples(w)[1] - kind.predicted(w, setting))
-            residual = np.concatenate(parts)
+            direct = [d.values - d.predicted(setting) for d in self._direct.get(w, ())]
+            residual = np.concatenate((residual, *direct))
             if i in moves:
                 residual = residual + linearised.windows[i].nuisance @ moves[i]
             residuals.append(residual)
