@@ -147,10 +147,9 @@ class Statistics:
 
     def by(self, groups: Sequence[int]) -> "Statistics":
         """Add up rows by group; ``groups``: number of each row's, shape (F,)."""
-        numbers, row = np.unique(groups, return_inverse=True)
-        order = np.argsort(row, kind="stable")
-        first = np.searchsorted(row[order], np.arange(len(numbers)))
-        return self._with_rows(numbers, lambda values: np.add.reduceat(values[order], first))
+        numbers = np.unique(groups)
+        members = np.equal.outer(numbers, groups).astype(float)
+        return self._with_rows(numbers, lambda values: np.tensordot(members, values, 1))
 
     def _with_rows(self, flights: ndarray, change: Callable[[ndarray], ndarray]) -> "Statistics":
         information = change(self.information)
@@ -281,21 +280,15 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     correlate by exp(-dt/time)."""
     if not gram.latents:
         return gram
-    factor = knot_factor(window, time)
-    knots = len(factor)
-    groups = gram.latents // knots
+    of_axis = knot_factor(window, time)
+    factor = np.kron(np.eye(gram.latents // len(of_axis)), of_axis)
     part = slice(gram.nuisances, gram.hidden)
-    channels, size = gram.cross.shape
     inner = gram.inner.copy()
-    rows = factor.T @ inner[:, part].reshape(channels, groups, knots, size)
-    inner[:, part] = rows.reshape(channels, -1, size)
-    columns_of = inner[:, :, part].reshape(-1, knots) @ factor
-    inner[:, :, part] = columns_of.reshape(channels, size, -1)
+    inner[:, part] = factor.T @ inner[:, part]
+    inner[:, :, part] = inner[:, :, part] @ factor
     cross = gram.cross.copy()
-    turned = cross[:, part].reshape(-1, knots) @ factor
-    cross[:, part] = turned.reshape(channels, -1)
-    whole = np.kron(np.eye(groups), factor)
-    return replace(gram, inner=inner, cross=cross, factor=whole)
+    cross[:, part] = cross[:, part] @ factor
+    return replace(gram, inner=inner, cross=cross, factor=factor)
 
 
 def knot_factor(window: Window, time: float) -> ndarray:

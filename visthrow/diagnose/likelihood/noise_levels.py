@@ -12,7 +12,6 @@ from functools import partial
 
 import numpy as np
 from numpy import ndarray
-from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood.integrals import fitted, look
 from visthrow.diagnose.likelihood.marginal import (
@@ -89,28 +88,17 @@ def fit(
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
-    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
-    has one maximum over it.
+    """Return rough levels with the likeliest correlation time; the search at each time begins with
+    the levels of the one before.
     """
     bare = [without_effects(gram) for gram in grams]
-    levels_of = {}
-
-    def likely(i: int, noise: Noise | None) -> float:
-        if i not in levels_of:
-            shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
-            begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
-            levels_of[i] = maximised(shaped, begin, ROUGHLY_NATS)
-        return levels_of[i][1]
-
-    best = len(CORRELATION_TIMES) // 2
-    likely(best, None)
-    for way in (-1, 1):
-        while 0 <= best + way < len(CORRELATION_TIMES):
-            noise, nats = levels_of[best]
-            if likely(best + way, noise) <= nats:
-                break
-            best += way
-    return levels_of[best][0]
+    found: list[tuple[float, Noise]] = []
+    for time in CORRELATION_TIMES:
+        shaped = correlated_of(bare, windows, time)
+        begin = found[-1][1] if found else _first_guess(shaped)
+        noise, nats = maximised(shaped, replace(begin, correlation_time=time), ROUGHLY_NATS)
+        found.append((nats, noise))
+    return max(found, key=lambda pair: pair[0])[1]
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
@@ -266,10 +254,7 @@ def _scoring_step(
     part /= size
     part.flat[:: len(part) + 1] += 1e-6
     right = slope[free] / size
-    _, solution, indefinite = lapack.dposv(part, right, lower=1)
-    if indefinite:
-        solution = np.linalg.solve(part, right)
-    step[free] = solution / size
+    step[free] = np.linalg.solve(part, right) / size
     promised = float(slope @ step)
     turned = _logarithms(step)
     whole = step[layout.shares] + step[layout.phases]

@@ -188,22 +188,14 @@ def smoothed(
     """Value and derivative at a time from a local cubic through the samples about it; None without
     enough of them.
     """
-    if (time, before, after) not in samples.estimates:
-        samples.estimates[time, before, after] = _smoothed(samples, time, before, after)
-    return samples.estimates[time, before, after]
-
-
-def _smoothed(
-    samples: ChannelSamples, instant: float, before: float, after: float
-) -> tuple[ndarray, ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
-        chosen = samples.during(instant - reach * before, instant + reach * after)
+        chosen = samples.during(time - reach * before, time + reach * after)
         if len(chosen.time) >= LEAST_SAMPLES:
-            time = chosen.time - instant
-            values = chosen.values
-            if values.shape[1] == 4:
-                return _smoothed_turn(time, values)
-            fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
+            since = chosen.time - time
+            if chosen.values.shape[1] == 4:
+                return _smoothed_turn(since, chosen.values)
+            degree = 2 if len(since) < 12 else 3
+            fit = np.polynomial.polynomial.polyfit(since, chosen.values, degree)
             return fit[0], fit[1]
     return None
 

@@ -3,7 +3,7 @@ and gyro.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
@@ -33,9 +33,6 @@ class ChannelSamples:
     time: ndarray  # [s], shape (T,)
     values: ndarray  # shape (T, 3) or (T, 4)
     sigma: float  # of one component; of an attitude the angle's [rad]
-    estimates: dict = field(
-        default_factory=dict, repr=False, compare=False
-    )  # what they say about times that were asked for before
 
     def during(self, first: float, last: float) -> "ChannelSamples":
         """Return the samples with first <= time < last."""
