@@ -17,6 +17,7 @@ conserved."""
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -232,7 +233,8 @@ VECTORS = {
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
 
-def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
+@lru_cache(maxsize=32)
+def terms_of(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
     have = set(quantities)
     scalars = [name for name, factor in SCALARS.items() if factor.needs <= have]
@@ -243,7 +245,7 @@ def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     for count in range(MOST_FACTORS + 1):
         for factors in combinations_with_replacement(scalars, count):
             terms += [Term(block, factors, vector) for vector in vectors]
-    return terms
+    return tuple(terms)
 
 
 def table(terms: Sequence[Term], values: KnotValues) -> ndarray:

@@ -118,7 +118,7 @@ class NumericModel(Model, ABC):
 
         Raises LogError: all lack one.
         """
-        present = [[name for name in self.needed if _holds(log, name)] for log in logs]
+        present = [[name for name in self.needed if log.samples(name, 1)] for log in logs]
         usable = [i for i, names in enumerate(present) if len(names) == len(self.needed)]
         if not usable:
             lacking = sorted(set(self.needed).difference(*present))
@@ -446,10 +446,6 @@ def _costs(aims: list[ndarray]) -> ndarray:
     """Return the sum of squares of each window; infinite where a simulation ran away."""
     squares = np.array([aim @ aim for aim in aims])
     return np.where(np.isnan(squares), np.inf, squares)
-
-
-def _holds(log: FlightLog, name: str) -> bool:
-    return name in log and bool(np.any(log[name].valid))
 
 
 def sigma_of(channel: Channel, floor: float) -> ndarray:

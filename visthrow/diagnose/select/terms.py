@@ -9,7 +9,7 @@ any other."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 from numpy import ndarray
@@ -62,11 +62,6 @@ LEAST_REACH = 1e-6  # span of the places of a scalar that never changes: its cur
 
 # terms that become effects to be weighed: as many as other sets that are simulated in their place
 WEIGHED = 6
-
-
-@lru_cache(maxsize=32)
-def _terms(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
-    return tuple(terms_of(block, quantities))
 
 
 @dataclass
@@ -141,7 +136,7 @@ class Survey:
         carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
         names = [set(point.windows[w].knots) for w in carriers]
         shared = tuple(sorted(set.intersection(*names))) if names else ()
-        terms = _terms(block, shared) if "time" in shared else ()
+        terms = terms_of(block, shared) if "time" in shared else ()
         if not terms:
             return None
         values_of = partial(_proportional, terms)

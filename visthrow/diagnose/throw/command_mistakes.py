@@ -128,7 +128,7 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else share > 0.0
     place = measured(log, "pos_w")
     if place is not None:
-        height = place.samples().at(time)[:, 2]
+        height = place.at(time)[:, 2]
         flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
@@ -152,9 +152,9 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
 def _followed(log: FlightLog) -> relations.Relation | None:
     """Return how the measured attitude's rates follow the commanded ones; None if nothing turns."""
     attitude = measured(log, "quat_wb")
-    if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
+    if attitude is None or "command" not in log or len(attitude.time) < 50:
         return None
-    rates = attitude.samples().rates()
+    rates = attitude.rates()
     time, command = log["command"].samples()
     if len(rates.time) < 50 or len(time) < 20 or np.max(np.std(rates.values, axis=0)) < MOVES:
         return None
@@ -205,7 +205,7 @@ def _thrust_unit(
     that it carries [N].
     """
     commands = [c for log in logs if (c := measured(log, "command")) is not None]
-    medians = [float(np.median(c.values[c.valid, 0])) for c in commands]
+    medians = [float(np.median(c.values[:, 0])) for c in commands]
     ratio = float(np.median(medians)) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:
         return None

@@ -200,16 +200,15 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     """Views of one window: stamps, points, what is valid of them, goal, and splines through poses
     that are smoothed on a grid about them.
     """
-    channel = measured(log, KEYPOINTS)
+    time, points = measured(log, KEYPOINTS)
     first, last = flight.payload.time[[0, -1]]
-    during = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
-    during &= (channel.time > first) & (channel.time < last)
+    during = (time >= c.start) & (time < c.end) & (time > first) & (time < last)
     if np.count_nonzero(during) < 5:
         return None
     valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
-    stamps = channel.time[during]
+    stamps = time[during]
     index = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
-    points = np.asarray(channel.values[during], dtype=float)
+    points = points[during].reshape(-1, *MEASURED.shape)
     visible = valid[np.minimum(index, len(valid) - 1)]
     goal = log["goal_w"].values[0] if "goal_w" in log else log.meta.get("goal_w")
     if goal is None:

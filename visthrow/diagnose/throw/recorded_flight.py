@@ -11,7 +11,7 @@ from numpy import ndarray
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
 from visthrow.logs.check.signals import sensor_sigma
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
 
 NEVER = 1e9  # a time after every flight [s]
@@ -75,21 +75,18 @@ class RecordedFlight:
         return min(self.command_time[-1] + period, self.vehicle.time[-1] + 1e-6)
 
 
-def measured(log: FlightLog, name: str) -> Channel | None:
-    """A channel as it was measured, where a log holds the truth beside it; None without any valid
-    sample.
+def measured(log: FlightLog, name: str) -> Samples | None:
+    """Return the valid samples of a channel as it was measured, where a log holds the truth beside
+    it; None without any.
     """
-    for candidate in (f"measured_{name}", name):
-        if candidate in log and np.any(log[candidate].valid):
-            return log[candidate]
-    return None
+    return log.samples(f"measured_{name}", 1) or log.samples(name, 1)
 
 
 def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
-    channel = measured(log, name)
-    if channel is None:
+    samples = measured(log, name)
+    if samples is None:
         return None
-    time, values = channel.samples()
+    time, values = samples
     fresh = np.ones(len(time), dtype=bool)
     fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
     if np.count_nonzero(fresh) < 5:
@@ -235,36 +232,35 @@ def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
 
 
 def _hanging(log: FlightLog) -> bool | None:
-    channel = measured(log, "attached")
-    return None if channel is None else bool(channel.samples().values[0, 0])
+    attached = measured(log, "attached")
+    return None if attached is None else bool(attached.values[0, 0])
 
 
 def _latch(log: FlightLog) -> float:
     """Return when the release was commanded."""
-    channel = measured(log, "release_command")
-    if channel is None:
+    commands = measured(log, "release_command")
+    if commands is None:
         return NEVER
-    time, values = channel.samples()
+    time, values = commands
     return float(min(time[values[:, 0] > 0.5], default=NEVER))
 
 
 def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
     """Time and point of the payload's landing."""
-    channel = measured(log, "landing")
-    if channel is None:
+    landing = measured(log, "landing")
+    if landing is None:
         return NEVER, None
-    time, points = channel.samples()
-    return float(time[0]), points[0]
+    return float(landing.time[0]), landing.values[0]
 
 
 def _voltage(log: FlightLog) -> float | None:
     """Terminal voltage at the start of a log: the median of the samples of its first moment, as
     single ones are noisy.
     """
-    channel = measured(log, "battery_voltage")
-    if channel is None:
+    voltage = measured(log, "battery_voltage")
+    if voltage is None:
         return None
-    time, volts = channel.samples()
+    time, volts = voltage
     return float(np.median(volts[time < time[0] + AT_START]))
 
 

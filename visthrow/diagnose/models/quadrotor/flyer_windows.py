@@ -182,27 +182,23 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
 
     Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only
     acceleration in z)."""
-    if "acc_b" not in log or not np.any(log["acc_b"].valid):
+    force_b = log.samples("acc_b", 1)
+    if force_b is None:
         return np.zeros((len(times), 3))
-    time, force = log["acc_b"].samples()
+    time, force = force_b
     share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
     share = share - np.median(share, axis=0)
     recent = cut_commands(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
     tilt, _ = lagged(*recent, times[:, None], 1.0 / rate)
     upright = np.array([0.0, 0.0, 1.0])
     turn = cross(np.pad(tilt, ((0, 0), (0, 1))), upright)
-    if "rate_b" in log and np.any(log["rate_b"].valid):
-        turn[:, :2] -= _offset(log, attitude)[:2] / rate
+    gyro = log.samples("rate_b", 1)
+    if gyro is not None:
+        stamps, turning = log[attitude].samples().rates()
+        # gyro less the rate of the estimated attitude, in the middle of the flight [rad/s]
+        offset = np.median(gyro.mean_over(stamps, 0.06) - turning, axis=0)
+        turn[:, :2] -= offset[:2] / rate
     return turn
-
-
-def _offset(log: FlightLog, attitude: str) -> ndarray:
-    """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape
-    (3,).
-    """
-    time, rate = log[attitude].samples().rates()
-    gyro = log["rate_b"].samples().mean_over(time, 0.06)
-    return np.median(gyro - rate, axis=0)
 
 
 def _line(table: Table, start: float) -> ndarray:
