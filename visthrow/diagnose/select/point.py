@@ -337,12 +337,12 @@ def moved(point: Point, theta: ndarray) -> Point | None:
     )
 
 
-def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int]) -> ndarray:
-    """Return the sizes of all effects that the simulation's distance from its linearisation would
-    be taken for, in floors, shape (K,).
+def curvature(origin: Point, moved_point: Point) -> float:
+    """Return the largest size of any effect that the simulation's distance from its linearisation
+    would be taken for while none is named, in floors.
 
     ``origin``: where the derivatives were taken; ``moved_point``: a point moved from it, with the
-    same derivatives; ``active``: effects that are named."""
+    same derivatives."""
     floors = origin.problem.priors.floor
     change = floors * (moved_point.theta - origin.theta)
     bent = []
@@ -350,12 +350,8 @@ def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int])
         bent.append(new.residual - (old.residual - old.effects @ change))
     grams = with_residuals(moved_point.grams, moved_point.windows, floors, bent)
     total = moved_point.integrals.statistics(grams, moved_point.theta).score.sum(0)
-    return moved_point.posterior.covariance(active) @ total
-
-
-def curvature(origin: Point, moved_point: Point) -> float:
-    """The largest size that :func:`linearisation_bias` says of any effect while none is named."""
-    return float(np.abs(linearisation_bias(origin, moved_point, ())).max(initial=0.0))
+    sizes = moved_point.posterior.covariance(()) @ total
+    return float(np.abs(sizes).max(initial=0.0))
 
 
 def with_all_effects_noise(point: Point) -> Point:

@@ -231,19 +231,16 @@ class InitialFit:
         if not fits:
             return
         ways = sorted({d for fit in fits for d in fit.free})
-        lanes = []
+        groups = []
         for row, fit in enumerate(fits):
             rows = [row, *[(1 + ways.index(d)) * len(fits) + row for d in fit.free]]
-            lanes += [Lane(fit.number, 0, row_moved, rough=True) for row_moved in rows]
+            groups.append([Lane(fit.number, 0, row_moved, rough=True) for row_moved in rows])
         moved = perturbed(rows_of(states, _numbers(fits)), [self.directions[d] for d in ways])
-        measured = self.flights.fly(self.simulation, moved, lanes, self._shortened).seen
-        first = 0
-        for fit in fits:
+        changes = self.flights.differences(self.simulation, moved, groups, self._shortened)
+        for fit, change in zip(fits, changes):
             steps = np.array([self.directions[d].step for d in fit.free])
-            change = self.flights.differences(measured, fit.number, first, len(steps))
             fit.slopes = change / steps * fit.sensitive[:, None]
             fit.aged = False
-            first += 1 + len(fit.free)
 
 
 def _numbers(fits: Sequence[_WindowFit]) -> ndarray:

@@ -227,16 +227,6 @@ class ReplayedFlights:
         """
         return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
 
-    def differences(self, seen: ndarray, w: int, first: int, count: int) -> ndarray:
-        """Return what ``count`` lanes of a window saw, less what the lane before them saw, shape
-        (N, count).
-
-        ``seen``: by all lanes; ``first``: number of the lane before."""
-        rows = int(self.rows[w])
-        lanes = seen[:rows, first : first + 1 + count]
-        columns = np.swapaxes(lanes, 1, 2).reshape(3 * rows, -1)
-        return columns[:, 1:] - columns[:, :1]
-
     def fly(
         self,
         simulation: Simulation,
@@ -272,6 +262,28 @@ class ReplayedFlights:
         """Fly lanes; returns each one's residual, see :meth:`residual` and :meth:`fly`."""
         seen = self.fly(simulation, states, lanes, recording).seen
         return [self.residual(seen, lane.window, i) for i, lane in enumerate(lanes)]
+
+    def differences(
+        self,
+        simulation: Simulation,
+        states: States,
+        groups: Sequence[Sequence[Lane]],
+        recording: Recording | None = None,
+    ) -> list[ndarray]:
+        """Fly lanes of some windows, a group of each window; returns what the others of a group
+        see, less what its first lane sees, shape (N, lanes - 1) each; see :meth:`fly`.
+        """
+        lanes = [lane for group in groups for lane in group]
+        seen = self.fly(simulation, states, lanes, recording).seen
+        first = 0
+        differences = []
+        for group in groups:
+            rows = int(self.rows[group[0].window])
+            last = first + len(group)
+            columns = np.swapaxes(seen[:rows, first:last], 1, 2).reshape(3 * rows, -1)
+            differences.append(columns[:, 1:] - columns[:, :1])
+            first = last
+        return differences
 
     def ended(self, ends: Sequence[float]) -> Recording:
         """The windows that end earlier [s]; what is seen afterwards says nothing."""

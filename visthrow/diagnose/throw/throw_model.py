@@ -18,7 +18,7 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
-from visthrow.diagnose.throw.command_columns import without_each_command
+from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import (
     direct_samples,
@@ -264,12 +264,27 @@ class ThrowModel(Model):
         return possible_together(self.entries, self.setting, theta)
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
-        """See the base class; the command before stays."""
-        states = self._settled_at[_key(theta)]
+        """See the base class.
+
+        A radio link loses commands or brings them late, and the vehicle goes on with what it has;
+        the log holds what was sent. Each window is flown once for each of its commands, with the
+        one before in its place."""
+        flights = self.flights
         delay = self.setting.plant.vehicle.queue.delay
+        groups = {}
+        for w in self._retained[list(windows)].tolist():
+            c = flights.cuts[w]
+            f = flights.flights[c.flight]
+            acting = find_acting(f.command_time, f.command, delay, c.start, c.end)
+            whole = Lane(w, 0, w, rough=True)
+            skipped = (flights.first_command[c.flight] + acting).tolist()
+            groups[w] = [whole, *[whole._replace(skip=number) for number in skipped]]
         simulation = self.simulation(self.at(theta))
-        numbers = self._retained[list(windows)]
-        return without_each_command(self.flights, numbers, delay, simulation, states)
+        states = self._settled_at[_key(theta)]
+        columns = []
+        for part in grouped(list(groups), [len(lanes) for lanes in groups.values()], BATCH):
+            columns += flights.differences(simulation, states, [groups[w] for w in part])
+        return columns
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
