@@ -5,7 +5,7 @@ from numpy.random import default_rng
 
 from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import allowed, between_flights
+from visthrow.diagnose.select.candidates import allowed, between_flights
 
 SIZE, OTHER = 20.0, 0.3
 """Of the named effect and of one that is not named, in floors."""

@@ -21,11 +21,14 @@ from visthrow.diagnose.select.candidates import (
     FLIGHT,
     NOTHING,
     Candidate,
+    Scatter,
+    freed,
+    own_shares,
     random_shares,
+    relinearised_per_flight,
     shared,
 )
 from visthrow.diagnose.select.occam import Linear, window
-from visthrow.diagnose.select.scatter import Scatter, freed, own_shares, relinearised_per_flight
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)

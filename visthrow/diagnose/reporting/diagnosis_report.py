@@ -16,8 +16,8 @@ from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.candidates import unit_suffix
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
-from visthrow.diagnose.select.scatter import unit_suffix
 from visthrow.view.parts import Grid, Picture, Section, Text, section
 
 OPEN = (result.CLASS, result.NOT_IDENTIFIABLE)

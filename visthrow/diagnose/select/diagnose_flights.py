@@ -13,7 +13,7 @@ from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out, lost_commands
-from visthrow.diagnose.select.candidates import ALL, NOTHING, Names
+from visthrow.diagnose.select.candidates import ALL, NOTHING, Names, Scatter
 from visthrow.diagnose.select.point import (
     ROUNDS,
     Point,
@@ -24,7 +24,6 @@ from visthrow.diagnose.select.point import (
     untracked_windows,
 )
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
-from visthrow.diagnose.select.scatter import Scatter
 from visthrow.diagnose.select.selection import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 from visthrow.diagnose.throw import command_mistakes as interface

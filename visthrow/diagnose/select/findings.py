@@ -8,9 +8,9 @@ import numpy as np
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, POSSIBLE, Sets
 from visthrow.diagnose.models.model_interface import Effect
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.candidates import allowed, unit_suffix
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Finding
-from visthrow.diagnose.select.scatter import allowed, unit_suffix
 
 BIT = 0.5
 """Flights say less than a bit about an effect whose posterior deviation exceeds this share of its

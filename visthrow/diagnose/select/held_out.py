@@ -32,13 +32,20 @@ from visthrow.diagnose.likelihood.forms import (
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.candidates import DAY, FLIGHT, NOTHING, Names, columns_of, shared
+from visthrow.diagnose.select.candidates import (
+    DAY,
+    FLIGHT,
+    NOTHING,
+    Names,
+    columns_of,
+    freed,
+    shared,
+)
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
 from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut, Level
-from visthrow.diagnose.select.scatter import freed
 
 MOST_FOLDS = 12
 FIRM = 1.0 - 1.0 / FEWEST

@@ -23,8 +23,7 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import Statistics, correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.select.point import Point
-from visthrow.diagnose.select.scatter import (
+from visthrow.diagnose.select.candidates import (
     COARSE,
     COMMAND,
     REACH,
@@ -33,6 +32,7 @@ from visthrow.diagnose.select.scatter import (
     integrated,
     judged,
 )
+from visthrow.diagnose.select.point import Point
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
 

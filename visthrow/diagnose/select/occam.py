@@ -23,19 +23,17 @@ from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG, Posterior
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import (
     ALL,
+    COARSE,
     DAY,
     EVENT,
     FLIGHT,
     NOTHING,
+    REACH,
     Candidate,
     Names,
-    columns_of,
-)
-from visthrow.diagnose.select.scatter import (
-    COARSE,
-    REACH,
     Shares,
     by_day,
+    columns_of,
     drifting,
     evidence_of,
     freed,

@@ -31,7 +31,7 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
-from visthrow.diagnose.select.scatter import Shares, freed, own_shares
+from visthrow.diagnose.select.candidates import Shares, freed, own_shares
 
 ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,

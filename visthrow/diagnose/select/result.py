@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import isnan
 from typing import Any
 
-from visthrow.diagnose.select.scatter import Scatter, unit_suffix
+from visthrow.diagnose.select.candidates import Scatter, unit_suffix
 from visthrow.diagnose.throw.command_mistakes import Mistake
 
 FOUND = "FOUND"

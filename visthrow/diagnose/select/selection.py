@@ -27,6 +27,7 @@ from visthrow.diagnose.select.candidates import (
     Names,
     columns_of,
     laws_of,
+    own_shares,
     random_shares,
     shared,
     without_means,
@@ -46,7 +47,6 @@ from visthrow.diagnose.select.point import (
     with_noise_at,
 )
 from visthrow.diagnose.select.result import SelectionStep
-from visthrow.diagnose.select.scatter import own_shares
 
 SHORTLIST = 12  # sets that promise most, which are simulated where they are near the best
 FIRST = 4  # sets that are simulated although they promise less than the best, by up to WINDOW

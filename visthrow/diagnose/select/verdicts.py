@@ -25,9 +25,18 @@ from visthrow.diagnose.select.candidates import (
     FLIGHT,
     Candidate,
     Names,
+    Scatter,
+    Shares,
     as_random,
+    between_flights,
+    by_day,
     columns_of,
+    freed,
+    judged,
     laws_of,
+    own_shares,
+    relinearised_per_flight,
+    unit_suffix,
 )
 from visthrow.diagnose.select.excess import (
     acts_on,
@@ -47,17 +56,6 @@ from visthrow.diagnose.select.point import (
     with_noise_at,
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import (
-    Scatter,
-    Shares,
-    between_flights,
-    by_day,
-    freed,
-    judged,
-    own_shares,
-    relinearised_per_flight,
-    unit_suffix,
-)
 from visthrow.diagnose.select.selection import Selector
 
 Answer = tuple[str, str, list[str], set[int]]
