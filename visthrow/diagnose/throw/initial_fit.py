@@ -70,9 +70,7 @@ class _WindowFit:
         aged: whether they come from elsewhere. stale: whether new ones are due.
     """
 
-    def __init__(
-        self, flights: ReplayedFlights, w: int, directions: Sequence[Direction], lag: float
-    ):
+    def __init__(self, flights: ReplayedFlights, w: int, directions: Sequence[Direction]):
         """Make ready; see :class:`InitialFit`."""
         sd = deviations(directions, [flights.cuts[w]])[0]
         self.number = w
@@ -80,7 +78,7 @@ class _WindowFit:
         self.sd = sd[self.free]
         self.sigma = flights.sigma[w]
         self.drift = drift(flights, w)
-        self.sensitive, self.end = sensitive_samples(flights, w, lag)
+        self.sensitive, self.end = sensitive_samples(flights, w)
         self.gusts = 1.0  # against the drift that is thought possible
         self.spread = np.hypot(self.sigma, self.drift)
         self.slopes: ndarray | None = None
@@ -168,15 +166,13 @@ class _WindowFit:
 class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
-    def __init__(self, flights: ReplayedFlights, simulation: Simulation, lag: float):
-        """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far
-        as known [s].
-        """
+    def __init__(self, flights: ReplayedFlights, simulation: Simulation):
+        """Make ready; ``simulation``: of the setting."""
         self.flights = flights
         self.simulation = simulation
         self.directions = directions(simulation.settings[0].plant)
         windows = range(len(flights.cuts))
-        self._fits = [_WindowFit(flights, w, self.directions, lag) for w in windows]
+        self._fits = [_WindowFit(flights, w, self.directions) for w in windows]
         self._shortened = flights.ended([fit.end for fit in self._fits])
 
     @property
@@ -256,14 +252,14 @@ def drift(flights: ReplayedFlights, w: int) -> ndarray:
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
 
-def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[ndarray, float]:
+def sensitive_samples(flights: ReplayedFlights, w: int) -> tuple[ndarray, float]:
     """Which samples tell of a window's start, and how long it is flown for their sake [s].
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
     few are left."""
     c = flights.cuts[w]
     time = flights.time[w]
-    time_left = flights.flights[c.flight].latch + lag - EARLIER
+    time_left = flights.separation(w) - EARLIER
     if c.payload != ATTACHED or not c.start + FITTED_SPAN < time_left < c.end:
         return np.ones(len(time)), c.end
     return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
@@ -275,15 +271,14 @@ def following(
     window: Window,
     free: ndarray,
     change: ndarray,
-    lag: float,
 ) -> ndarray:
     """Return how a window's initial state follows a change of the effects, so that the flight stays
     as near to where it was as it can, in the state's units, shape (D,).
 
     ``free``: which parts of the state follow, shape (D,), bool; ``change``: of the effects' sizes,
-    shape (K,); ``lag``: of the release, as far as known [s]."""
+    shape (K,)."""
     samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
-    sensitive = sensitive_samples(flights, w, lag)[0]
+    sensitive = sensitive_samples(flights, w)[0]
     weight = sensitive / np.hypot(flights.sigma[w], drift(flights, w))
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight[:, None]

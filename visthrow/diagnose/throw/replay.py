@@ -128,12 +128,15 @@ class ReplayedFlights:
         self,
         flights: Sequence[RecordedFlight],
         cuts: Sequence[Cut],
-        delays: tuple[float, float, float],
+        setting: Setting,
     ):
-        """Lay out flights and windows.
+        """Lay out flights and windows in the time of their sensors.
 
-        ``delays``: of vehicle, payload and gyro that the setting knows of [s].
+        ``setting``: whose delays of sensors and release are known.
         """
+        x = setting.sensing
+        delays = x.vehicle_delay, x.vehicle_delay, x.payload_delay, x.gyro_delay
+        self._lag = setting.plant.release.lag
         self.flights = list(flights)
         self.cuts = list(cuts)
         spans = np.array([c.end - c.start for c in cuts])
@@ -179,12 +182,12 @@ class ReplayedFlights:
             "gyro_time": np.concatenate([part.time for part in gyro]),
         }
 
-    def _samples_in(self, c: Cut, delays: tuple[float, float, float]) -> list[ChannelSamples]:
+    def _samples_in(self, c: Cut, delays: Sequence[float]) -> list[ChannelSamples]:
         """Return the window's samples of vehicle, attitude, payload and gyro."""
         f = self.flights[c.flight]
         payload = f.payload if c.payload in (ATTACHED, LOOSE) else None
         samples = []
-        for source, delay in zip((f.vehicle, f.attitude, payload, f.gyro), (delays[0], *delays)):
+        for source, delay in zip((f.vehicle, f.attitude, payload, f.gyro), delays):
             source = source or NO_SAMPLES
             samples.append(source.during(c.start + delay + EARLY, c.end + delay))
         return samples
@@ -211,6 +214,10 @@ class ReplayedFlights:
             "payload_count": len(payload.time),
             "gyro_count": len(gyro.time),
         }
+
+    def separation(self, w: int) -> float:
+        """Return when the payload of a window's flight leaves, as far as known [s]."""
+        return self.flights[self.cuts[w].flight].latch + self._lag
 
     def kind(self, w: int) -> tuple[int, bool]:
         """Return the payload at a window's start, and whether the latch holds it until the end."""

@@ -140,8 +140,7 @@ class ThrowModel(Model):
 
     def cut_into(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
         """Return these windows of flights, in the time of their sensors."""
-        x = self.setting.sensing
-        return ReplayedFlights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+        return ReplayedFlights(flights, cuts, self.setting)
 
     def _settled_without_slack(
         self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
@@ -297,10 +296,9 @@ class ThrowModel(Model):
         ways = directions(setting.plant)
         present = deviations(ways, self.flights.cuts) > 0.0
         follows = np.array([x.follows for x in ways])
-        lag = self.setting.plant.release.lag
 
         def move(w: int, window: Window) -> ndarray:
-            return following(self.flights, w, window, follows[present[w]], change, lag)
+            return following(self.flights, w, window, follows[present[w]], change)
 
         numbers = self._retained[list(linearised.windows)]
         sizes = np.zeros(present.shape)
@@ -341,7 +339,7 @@ class ThrowModel(Model):
 
     def _initial_fit(self, setting: Setting, flights: ReplayedFlights) -> InitialFit:
         """Return the fit of initial states in a setting."""
-        return InitialFit(flights, self.simulation(setting), self.setting.plant.release.lag)
+        return InitialFit(flights, self.simulation(setting))
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
@@ -375,7 +373,7 @@ class ThrowModel(Model):
         for w, c in enumerate(self.flights.cuts):
             first = float(ends["slack_first"][w])
             last = float(ends["slack_last"][w])
-            separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
+            separation = self.flights.separation(w)
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
                 c = dataclasses.replace(c, after_slack=True)
             if last < c.start:
