@@ -30,7 +30,7 @@ from examples.pendulum.swing_model import ENCODER, PendulumModel
 from examples.trim.trim_model import E8, E9, UNTRIMMED, TrimModel
 from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
-from visthrow.diagnose.apply import patch
+from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.models.numeric import NumericModel
@@ -520,9 +520,7 @@ def _unseen(
     """Return errors on other flights of the plain model and of one with the sizes that `apply`
     writes, and of noise alone.
     """
-    written = report.to_json(diagnosis)
-    sizes, _ = patch.with_scatter(*patch.read(written, "the diagnosis"), written)
-    extended.extend(sizes)
+    extended.extend(SavedDiagnosis(report.to_json(diagnosis), "the diagnosis").sizes[0])
     measured = on_others(plain, extended, {}, diagnosis).errors
     return {channel: list(errors) for channel, errors in measured.items()}
 

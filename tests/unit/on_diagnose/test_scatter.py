@@ -12,7 +12,7 @@ from pytest import approx, mark
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
 from tests.synthetic_diagnosis import SyntheticModel, explain_without_laws
 from visthrow.config.effects import catalogue, random_effects
-from visthrow.diagnose.apply import patch
+from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import result, verdicts
@@ -159,16 +159,21 @@ def test_deviations_are_found_with_their_size():
     assert abs(np.median([w.get("gust", 0.0) for w in gusts]) - 0.25) < 0.08
 
 
+def sizes_of(rows, theta, covariance):
+    """Sizes and covariance of a flight to come, by a diagnosis as it is written."""
+    report = {"scatter": rows, "theta": theta, "covariance": covariance}
+    return SavedDiagnosis(report, "the diagnosis").sizes
+
+
 def test_training_draws_what_varies():
     varies = {"name": "lag_jitter", "found": True, "size": 0.01, "of": ["release_lag"]}
-    report = {"scatter": [varies]}
-    theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)
+    theta, covariance = sizes_of([varies], {"rope_length": 0.01}, [[1e-8]])
     assert theta == {"rope_length": 0.01, "release_lag": 0.0}
     assert_allclose(covariance, np.diag([1e-8, 1e-4]))
     varies["mean"] = {"release_lag": 0.005}
-    theta, covariance = patch.with_scatter({}, [], report)
+    theta, covariance = sizes_of([varies], {}, [])
     assert theta == {"release_lag": 0.005}
-    theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
+    theta, covariance = sizes_of([varies], {"release_lag": 0.02}, [[1e-6]])
     assert theta == {"release_lag": 0.02}
     assert_allclose(covariance, [[1.01e-4]])
 
@@ -178,7 +183,7 @@ def test_what_varies_by_flight_and_by_day_varies_by_both_in_training():
         {"name": f"by_{by}", "found": True, "size": size, "of": ["release_lag"]}
         for by, size in (("flight", 0.01), ("day", 0.02))
     ]
-    covariance = patch.with_scatter({}, [], {"scatter": rows})[1]
+    covariance = sizes_of(rows, {}, [])[1]
     assert_allclose(covariance, [[5e-4]])
 
 

@@ -2,24 +2,24 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from visthrow import config
 from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 
-HARM = 0.02  # share by which a channel may get worse on held-out flights
-
+if TYPE_CHECKING:
+    from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 
 add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the file."""
-    import json
-
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.apply import patch
+    from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.inputs.model_arguments import THROW
     from visthrow.logs import BLACKBOX
@@ -27,23 +27,19 @@ def run(args: argparse.Namespace) -> int:
 
     if Path(args.diagnosis).suffix.lower() in BLACKBOX:
         return _apply_firmware(args)
-    try:
-        report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DiagnoseError(f"{args.diagnosis}: not readable as a diagnosis: {error}") from error
-    theta, covariance = patch.read(report, args.diagnosis)
-    model = report.get("model", THROW)
-    of_throw = model == THROW and not args.config
-    if args.laws and (why := setup.MODELS[model].lawless if model in setup.MODELS else ""):
+    saved = SavedDiagnosis.read(args.diagnosis)
+    of_throw = saved.model == THROW and not args.config
+    lawless = setup.MODELS[saved.model].lawless if saved.model in setup.MODELS else ""
+    if args.laws and lawless:
         raise DiagnoseError(
-            f"{args.diagnosis}: no law can act in the model '{model}': {why}; expected no --laws"
+            f"{saved.path}: no law can act in the model '{saved.model}': {lawless}; expected no"
+            " --laws"
         )
-    laws = patch.laws_of(report, args.diagnosis, args.laws)
+    theta, covariance = saved.sizes
+    laws = saved.laws(args.laws)
+    account = saved.origin()
     if of_throw:
-        patch.refuse_strange(report, args.diagnosis, theta, catalogue(), THROW)
-    theta, covariance = patch.with_scatter(theta, covariance, report)
-    account = origin(report, args.diagnosis)
-    if of_throw:
+        saved.refuse_strange(theta, catalogue())
         theta, covariance, transient = patch.without_transient(theta, covariance)
         if transient:
             account.append(f"Not written: {', '.join(transient)}; a state of these flights only.")
@@ -51,21 +47,27 @@ def run(args: argparse.Namespace) -> int:
     if not theta and not laws:
         hint = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         what = "configuration" if of_throw else "setup"
-        print(f"nothing to write{hint if report.get('laws') else ''}; the {what} stands as it is")
+        law = hint if saved.report.get("laws") else ""
+        print(f"nothing to write{law}; the {what} stands as it is")
         return 0
-    _bear_out(report, args.anyway)
+    doubts = saved.doubts()
+    if doubts and not args.anyway:
+        raise DiagnoseError(
+            f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all"
+            " the same"
+        )
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )
-    name = _made_with(report, args, option, folder)
+    name = _made_with(saved, getattr(args, option), option, folder)
     base = _named(folder, name)
     diagnosed = config.load(
-        schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ()
+        schema, config.find(folder, name), saved.report.get("overrides", ()) if of_throw else ()
     )
     content = (
         patch.text(base, diagnosed, theta, covariance, args.plants, account, laws)
         if of_throw
-        else patch.of_setup(base, diagnosed, report, args.diagnosis, account, args.laws)
+        else patch.of_setup(base, diagnosed, saved, account, args.laws)
     )
     atomic_write(args.out, content)
     config.load(schema, Path(args.out))  # as training, or the next diagnosis, will read it
@@ -98,36 +100,20 @@ def _apply_firmware(args: argparse.Namespace) -> int:
     return 0
 
 
-def _bear_out(report: dict, anyway: bool) -> None:
-    """Refuse what held-out flights deny.
-
-    Raises DiagnoseError: they do, and nobody wants it all the same.
-    """
-    # of a law alone, held-out flights have not been asked
-    doubts = harm(report) if report.get("theta") else []
-    if doubts and not anyway:
-        raise DiagnoseError(
-            f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all"
-            " the same"
-        )
-
-
-def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str) -> str:
+def _made_with(saved: "SavedDiagnosis", requested: str | None, option: str, folder: str) -> str:
     """Name of the plant or config that was diagnosed: sizes are counted from there.
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
     """
-    recorded = report.get(option)
-    requested = getattr(args, option)
+    recorded = saved.report.get(option)
     if not (recorded or requested):
-        model = report.get("model", "throw")
         raise DiagnoseError(
-            f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected"
+            f"{saved.path}: a diagnosis of the model '{saved.model}' names no {option}; expected"
             f" --{option} NAME"
         )
     if recorded and requested and _named(folder, recorded) != _named(folder, requested):
         raise DiagnoseError(
-            f"{args.diagnosis}: made with --{option} {recorded}; its sizes do not count from "
+            f"{saved.path}: made with --{option} {recorded}; its sizes do not count from "
             f"{requested}"
         )
     return recorded or requested
@@ -138,64 +124,3 @@ def _named(folder: str, name: str) -> str:
     path = config.find(folder, name)
     shipped = path.is_relative_to(config.configs_root())
     return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())
-
-
-def harm(report: dict) -> list[str]:
-    """Reasons against a diagnosis: channels that held-out flights show worse with it,
-    or no better.
-    """
-    gain = report.get("gain") or {}
-    reasons = []
-    for c in gain.get("channels", ()):
-        if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]:
-            reasons.append(f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %")
-    nats = gain.get("nats_per_sample")
-    if nats is not None and nats <= 0.0:
-        reasons.append(f"log-likelihood {nats:+.3g} nats a sample")
-    return reasons
-
-
-def origin(report: dict, path: str) -> list[str]:
-    """Lines on where a diagnosis comes from."""
-    lines = [
-        f"Extended by `visthrow diagnose apply` from {path}:"
-        f" {report.get('overall', 'a diagnosis')}.",
-        f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
-        f" {report.get('samples', 0)} samples.",
-    ]
-    provenance = report.get("provenance") or {}
-    for name in ("commit", "time", "command"):
-        if provenance.get(name):
-            lines.append(f"{name}: {provenance[name]}")
-    theta = report.get("theta", {})
-    gain = report.get("gain") or {}
-    for c in gain.get("channels", ()) if theta else ():
-        lines.append(
-            f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
-            f" {c.get('after', 0.0):.3g} after."
-        )
-    if landing := gain.get("landing"):
-        lines.append(
-            f"Landing error of {landing['throws']} throws: {landing['before']:.3g} m before,"
-            f" {landing['after']:.3g} m after."
-        )
-    sizes = []
-    for f in report.get("findings") or []:
-        if f["name"] in theta and f.get("low") is not None:
-            sizes.append(
-                f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
-                f" {f['high']:.3g})."
-            )
-    if sizes:
-        lines.append(
-            "Sizes and intervals as `explain` printed them. The deviations below also allow for"
-            " differences between flights."
-        )
-    lines += sizes
-    for s in report.get("scatter") or []:
-        if s["found"]:
-            group = s.get("by", "flight")
-            lines.append(
-                f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
-            )
-    return lines

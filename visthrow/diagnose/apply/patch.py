@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
-from sim.effects.effect import Effect, apply
+from sim.effects.effect import apply
 from sim.effects.firmware import calibrated_voltage, controller_of, left_out
 from sim.effects.setting import Setting, generalised, specialised
 from sim.kernels.laws import check_laws
 from sim.params import GRAVITY, LawParams
 from visthrow import config
-from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
-from visthrow.diagnose.inputs.model_arguments import THROW
+from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.inputs.setup import Setup
-from visthrow.diagnose.models.catalogue import beyond_bounds, effects_of
+from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, load_experiment, plant_of
@@ -128,25 +128,6 @@ def _commented(
     return lines
 
 
-def with_scatter(
-    theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
-) -> tuple[dict[str, float], np.ndarray]:
-    """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to flight
-    has the mean of those that were flown, and their scatter, to which that of days adds.
-    """
-    sizes = dict(theta)
-    variance = dict.fromkeys(theta, 0.0)
-    for row in report.get("scatter") or []:
-        means = row.get("mean", {})
-        for name in row["of"] if row["found"] else ():
-            sizes.setdefault(name, float(means.get(name, 0.0)))
-            variance[name] = variance.get(name, 0.0) + float(row["size"]) ** 2
-    whole = np.diag(list(variance.values()))
-    count = len(theta)
-    whole[:count, :count] += np.reshape(covariance, (count, count))
-    return sizes, whole
-
-
 def without_transient(
     theta: Mapping[str, float], covariance: np.ndarray
 ) -> tuple[dict[str, float], np.ndarray, list[str]]:
@@ -158,57 +139,6 @@ def without_transient(
     sizes = {name: size for name, size in theta.items() if name not in transient}
     rows = [i for i, name in enumerate(theta) if name in sizes]
     return sizes, covariance[np.ix_(rows, rows)], transient
-
-
-def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
-    """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0.
-
-    Raises DiagnoseError: it holds fewer, or one that no grammar has.
-    """
-    laws = []
-    for x in _explanation(report, path, rank):
-        factors = tuple(x["factors"])
-        try:
-            laws.append(LawParams(x["block"], factors, x["vector"], float(x["coefficient"])))
-        except ValueError as error:
-            raise DiagnoseError(f"{path}: {error}") from None
-    return laws
-
-
-def _explanation(report: Mapping[str, Any], path: str, rank: int) -> list[dict[str, Any]]:
-    """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
-    explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
-    if rank > len(explanations):
-        choices = f"expected a number up to {len(explanations)}"
-        if not explanations:
-            reasons = "; ".join(report.get("reasons") or ["none"])
-            choices = (
-                "it holds none: a formula is a law only where flights that are left out repeat its"
-                f" coefficient. Reasons of its verdict: {reasons}"
-            )
-        raise DiagnoseError(f"{path}: --laws asks for number {rank} of its laws; {choices}")
-    return explanations[rank - 1] if rank else []
-
-
-def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
-    """Sizes and covariance from the JSON that ``explain`` wrote.
-
-    Raises DiagnoseError: something is missing.
-    """
-    try:
-        theta = {str(name): float(size) for name, size in report["theta"].items()}
-        covariance = [[float(x) for x in row] for row in report["covariance"]]
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else error
-        raise DiagnoseError(
-            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {reason}"
-        ) from error
-    if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
-        raise DiagnoseError(
-            f"{path}: {len(theta)} effects and a covariance of {len(covariance)} rows; expected one"
-            " each"
-        )
-    return theta, covariance
 
 
 def with_firmware(
@@ -247,8 +177,7 @@ def with_firmware(
 def of_setup(
     base: str,
     setup: Setup,
-    report: Mapping[str, Any],
-    path: str,
+    saved: SavedDiagnosis,
     provenance: Sequence[str],
     rank: int = 0,
 ) -> str:
@@ -260,27 +189,25 @@ def of_setup(
     Args:
         base: path of the diagnosed setup, as ``base =`` is to name it.
         setup: that setup.
-        report: of the diagnosis. path: of its file.
+        saved: the diagnosis.
         provenance: lines on where it comes from.
         rank: of the explanation whose laws are written, from 1; 0 for none.
     """
-    theta, covariance = with_scatter(*read(report, path), report)
-    model = report.get("model", THROW)
-    if model != setup.model:
+    theta, covariance = saved.sizes
+    if saved.model != setup.model:
         raise DiagnoseError(
-            f"{path}: a diagnosis of the model '{model}'; the model of {base} is"
+            f"{saved.path}: a diagnosis of the model '{saved.model}'; the model of {base} is"
             f" {setup.model or 'none'}"
         )
     effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
-    refuse_strange(report, path, after, effects, setup.model)
+    saved.refuse_strange(after, effects)
     changed: dict[str, Any] = {}
     words = {}
     comments = [*provenance, *_rows_of(list(theta), covariance)]
-    if laws := laws_of(report, path, rank):
+    if laws := saved.laws(rank):
         changed["laws"] = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
-        terms = _explanation(report, path, rank)
-        rows = [x.get("covariance") or [x["sd"] ** 2] for x in terms]
+        rows = [x.get("covariance") or [x["sd"] ** 2] for x in saved.explanation(rank)]
         comments += _rows_of([term_of(law).formula for law in laws], rows)
     if theta:
         changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}
@@ -293,40 +220,3 @@ def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> lis
     """Return the comments that hold a covariance."""
     rows = [f"  {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
     return [f"covariance of {', '.join(names)}:", *rows] if names else []
-
-
-def refuse_strange(
-    report: Mapping[str, Any],
-    path: str,
-    theta: Mapping[str, float],
-    effects: Mapping[str, Effect],
-    model_name: str,
-) -> None:
-    """Refuse effects that are none of a model's, though they may bear the same name, and sizes that
-    it cannot have.
-
-    Raises DiagnoseError: an effect or its unit is none of the model's; a size lies outside its
-    bounds.
-
-    Args:
-        report: of the diagnosis. path: of its file.
-        theta: sizes that the model would have.
-        effects: its effects.
-        model_name: its name.
-    """
-    strange = [name for name in theta if name not in effects]
-    if strange:
-        raise DiagnoseError(
-            f"{path}: {', '.join(strange)} are no effects of the {model_name};"
-            f" {suggest(strange[0], effects)}"
-        )
-    units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
-    for name, size in theta.items():
-        effect = effects[name]
-        if units.get(name, effect.unit) != effect.unit:
-            raise DiagnoseError(
-                f"{path}: {name} in '{units[name]}'; the {model_name}'s {name} is in"
-                f" '{effect.unit}': of another model"
-            )
-        if beyond := beyond_bounds(effect, size):
-            raise DiagnoseError(f"{path}: {beyond} in the {model_name}")

@@ -1,0 +1,185 @@
+"""The JSON that ``explain`` wrote: what was found, where it comes from, what speaks against it."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.effects.effect import Effect
+from sim.params import LawParams
+from visthrow.common.errors import DiagnoseError, suggest
+from visthrow.diagnose.inputs.model_arguments import THROW
+from visthrow.diagnose.models.catalogue import beyond_bounds
+
+HARM = 0.02  # share by which a channel may get worse on held-out flights
+
+
+@dataclass(frozen=True)
+class SavedDiagnosis:
+    """A diagnosis as ``explain`` wrote it."""
+
+    report: Mapping[str, Any]
+    path: str  # of its file, for messages
+
+    @staticmethod
+    def read(path: str) -> "SavedDiagnosis":
+        """Read a file.
+
+        Raises DiagnoseError: it holds no JSON."""
+        try:
+            return SavedDiagnosis(json.loads(Path(path).read_text(encoding="utf-8")), path)
+        except (OSError, ValueError) as error:
+            raise DiagnoseError(f"{path}: not readable as a diagnosis: {error}") from error
+
+    @property
+    def model(self) -> str:
+        """Name of the diagnosed model."""
+        return str(self.report.get("model", THROW))
+
+    @cached_property
+    def sizes(self) -> tuple[dict[str, float], np.ndarray]:
+        """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to
+        flight has the mean of those that were flown, and their scatter, to which that of days adds.
+
+        Raises DiagnoseError: something is missing."""
+        try:
+            theta = {str(name): float(size) for name, size in self.report["theta"].items()}
+            covariance = [[float(x) for x in row] for row in self.report["covariance"]]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            reason = f"it has no {error}" if isinstance(error, KeyError) else error
+            raise DiagnoseError(
+                f"{self.path}: no diagnosis that `visthrow diagnose explain` wrote: {reason}"
+            ) from error
+        count = len(theta)
+        if len(covariance) != count or any(len(row) != count for row in covariance):
+            raise DiagnoseError(
+                f"{self.path}: {count} effects and a covariance of {len(covariance)} rows; expected"
+                " one each"
+            )
+        variance = dict.fromkeys(theta, 0.0)
+        for row in self.report.get("scatter") or []:
+            means = row.get("mean", {})
+            for name in row["of"] if row["found"] else ():
+                theta.setdefault(name, float(means.get(name, 0.0)))
+                variance[name] = variance.get(name, 0.0) + float(row["size"]) ** 2
+        whole = np.diag(list(variance.values()))
+        whole[:count, :count] += np.reshape(covariance, (count, count))
+        return theta, whole
+
+    def laws(self, rank: int) -> list[LawParams]:
+        """All laws of the explanation of this rank, from 1; none for 0.
+
+        Raises DiagnoseError: there are fewer, or one that no grammar has.
+        """
+        laws = []
+        for x in self.explanation(rank):
+            factors = tuple(x["factors"])
+            try:
+                laws.append(LawParams(x["block"], factors, x["vector"], float(x["coefficient"])))
+            except ValueError as error:
+                raise DiagnoseError(f"{self.path}: {error}") from None
+        return laws
+
+    def explanation(self, rank: int) -> list[dict[str, Any]]:
+        """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
+        report = self.report
+        explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
+        if rank > len(explanations):
+            choices = f"expected a number up to {len(explanations)}"
+            if not explanations:
+                reasons = "; ".join(report.get("reasons") or ["none"])
+                choices = (
+                    "it holds none: a formula is a law only where flights that are left out repeat"
+                    f" its coefficient. Reasons of its verdict: {reasons}"
+                )
+            asked = f"--laws asks for number {rank} of its laws"
+            raise DiagnoseError(f"{self.path}: {asked}; {choices}")
+        return explanations[rank - 1] if rank else []
+
+    def refuse_strange(self, theta: Mapping[str, float], effects: Mapping[str, Effect]) -> None:
+        """Refuse effects that are none of the model's, though they may bear the same name, and
+        sizes that it cannot have.
+
+        ``theta``: sizes that the model would have; ``effects``: its effects. Raises DiagnoseError:
+        an effect or its unit is none of the model's; a size lies outside its bounds."""
+        strange = [name for name in theta if name not in effects]
+        if strange:
+            raise DiagnoseError(
+                f"{self.path}: {', '.join(strange)} are no effects of the {self.model};"
+                f" {suggest(strange[0], effects)}"
+            )
+        findings = self.report.get("findings") or []
+        units = {f["name"]: f["unit"] for f in findings if "unit" in f}
+        for name, size in theta.items():
+            effect = effects[name]
+            if units.get(name, effect.unit) != effect.unit:
+                raise DiagnoseError(
+                    f"{self.path}: {name} in '{units[name]}'; the {self.model}'s {name} is in"
+                    f" '{effect.unit}': of another model"
+                )
+            if beyond := beyond_bounds(effect, size):
+                raise DiagnoseError(f"{self.path}: {beyond} in the {self.model}")
+
+    def doubts(self) -> list[str]:
+        """Return reasons against it: channels that held-out flights show worse with it, or no
+        better; of a law alone, held-out flights have not been asked.
+        """
+        gain = self.report.get("gain") or {}
+        reasons = []
+        for c in gain.get("channels", ()):
+            if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]:
+                reasons.append(f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %")
+        nats = gain.get("nats_per_sample")
+        if nats is not None and nats <= 0.0:
+            reasons.append(f"log-likelihood {nats:+.3g} nats a sample")
+        return reasons if self.report.get("theta") else []
+
+    def origin(self) -> list[str]:
+        """Lines on where it comes from."""
+        report = self.report
+        lines = [
+            f"Extended by `visthrow diagnose apply` from {self.path}:"
+            f" {report.get('overall', 'a diagnosis')}.",
+            f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
+            f" {report.get('samples', 0)} samples.",
+        ]
+        provenance = report.get("provenance") or {}
+        for name in ("commit", "time", "command"):
+            if provenance.get(name):
+                lines.append(f"{name}: {provenance[name]}")
+        theta = report.get("theta", {})
+        gain = report.get("gain") or {}
+        for c in gain.get("channels", ()) if theta else ():
+            lines.append(
+                f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
+                f" {c.get('after', 0.0):.3g} after."
+            )
+        if landing := gain.get("landing"):
+            lines.append(
+                f"Landing error of {landing['throws']} throws: {landing['before']:.3g} m before,"
+                f" {landing['after']:.3g} m after."
+            )
+        sizes = []
+        for f in report.get("findings") or []:
+            if f["name"] in theta and f.get("low") is not None:
+                sizes.append(
+                    f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
+                    f" {f['high']:.3g})."
+                )
+        if sizes:
+            lines.append(
+                "Sizes and intervals as `explain` printed them. The deviations below also allow for"
+                " differences between flights."
+            )
+        lines += sizes
+        for s in report.get("scatter") or []:
+            if s["found"]:
+                group = s.get("by", "flight")
+                lines.append(
+                    f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
+                )
+        return lines
