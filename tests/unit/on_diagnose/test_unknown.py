@@ -292,7 +292,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     )
     best = at.best.point
     grams = [with_latent_effects(gram) for gram in best.grams]
-    parts = terms.integrals(grams, best.noise).statistics(grams, best.theta)
+    parts = terms.Integrals(grams, best.noise).statistics(grams, best.theta)
     of = terms.Survey(best, parts, []).screen(block)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
         (point,) = terms.extended([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
