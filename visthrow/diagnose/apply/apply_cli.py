@@ -50,12 +50,8 @@ def run(args: argparse.Namespace) -> int:
         law = hint if saved.report.get("laws") else ""
         print(f"nothing to write{law}; the {what} stands as it is")
         return 0
-    doubts = saved.doubts()
-    if doubts and not args.anyway:
-        raise DiagnoseError(
-            f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all"
-            " the same"
-        )
+    if not args.anyway:
+        saved.refuse_denied()
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )

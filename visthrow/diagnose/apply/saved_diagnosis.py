@@ -124,10 +124,11 @@ class SavedDiagnosis:
             if beyond := beyond_bounds(effect, size):
                 raise DiagnoseError(f"{self.path}: {beyond} in the {self.model}")
 
-    def doubts(self) -> list[str]:
-        """Return reasons against it: channels that held-out flights show worse with it, or no
-        better; of a law alone, held-out flights have not been asked.
-        """
+    def refuse_denied(self) -> None:
+        """Refuse what held-out flights deny.
+
+        Raises DiagnoseError: channels get worse with it, or no better; of a law alone, held-out
+        flights have not been asked."""
         gain = self.report.get("gain") or {}
         reasons = []
         for c in gain.get("channels", ()):
@@ -136,7 +137,11 @@ class SavedDiagnosis:
         nats = gain.get("nats_per_sample")
         if nats is not None and nats <= 0.0:
             reasons.append(f"log-likelihood {nats:+.3g} nats a sample")
-        return reasons if self.report.get("theta") else []
+        if reasons and self.report.get("theta"):
+            raise DiagnoseError(
+                f"held-out flights do not bear this out: {'; '.join(reasons)}; --anyway writes it"
+                " all the same"
+            )
 
     def origin(self) -> list[str]:
         """Lines on where it comes from."""

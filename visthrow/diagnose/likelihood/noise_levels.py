@@ -88,17 +88,28 @@ def fit(
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
-    """Return rough levels with the likeliest correlation time; the search at each time begins with
-    the levels of the one before.
+    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
+    has one maximum over it.
     """
     bare = [without_effects(gram) for gram in grams]
-    found: list[tuple[float, Noise]] = []
-    for time in CORRELATION_TIMES:
-        shaped = correlated_of(bare, windows, time)
-        begin = found[-1][1] if found else _first_guess(shaped)
-        noise, nats = maximised(shaped, replace(begin, correlation_time=time), ROUGHLY_NATS)
-        found.append((nats, noise))
-    return max(found, key=lambda pair: pair[0])[1]
+    levels_of = {}
+
+    def likely(i: int, noise: Noise | None) -> float:
+        if i not in levels_of:
+            shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
+            begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
+            levels_of[i] = maximised(shaped, begin, ROUGHLY_NATS)
+        return levels_of[i][1]
+
+    best = len(CORRELATION_TIMES) // 2
+    likely(best, None)
+    for way in (-1, 1):
+        while 0 <= best + way < len(CORRELATION_TIMES):
+            noise, nats = levels_of[best]
+            if likely(best + way, noise) <= nats:
+                break
+            best += way
+    return levels_of[best][0]
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
