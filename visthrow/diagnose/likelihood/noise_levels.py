@@ -164,7 +164,7 @@ class _Layout:
         pairs = [(block, gram.phase) for gram in grams for block in range(blocks)]
         phases = np.array([number.get(pair, 0) for pair in pairs], dtype=int)
         shares = len(keys) + np.arange(len(phases))
-        scales = shares[-1] + 1 + np.arange(len(noise.scale))
+        scales = len(keys) + len(phases) + np.arange(len(noise.scale))
         parts = (
             phases.reshape(windows, -1),
             np.tile(scales, (windows, 1)),
