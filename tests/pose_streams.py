@@ -93,7 +93,7 @@ STREAMS = {
     "jitter": PoseStream("stamps scatter by 4", jitter),
     "bursts": PoseStream("they come in bursts", bursts),
     "half refused": PoseStream("50 % of the poses are refused (", wrong=2),
-    "2 kHz": PoseStream("2000 poses a second; expected 582 at most", regular(2000.0)),
+    "700 Hz": PoseStream("700 poses a second; expected 582 at most", regular(700.0)),
 }
 """Good streams, then bad ones."""
 

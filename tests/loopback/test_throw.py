@@ -7,11 +7,10 @@ from numpy.linalg import norm
 from pytest import mark
 
 from tests.loopback.wire import throw
-from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make
 
 LANDING = 0.05
-"""Mean landing error over the wire of two throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of
+"""Landing error over the wire of a throw at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of
 loss; 0.10 m is asked for.
 """
 
@@ -21,20 +20,11 @@ READ_BACK = 0.01
 
 @mark.parametrize("policy", ["state", "vision"])
 def test_throws_in_lock_step(policy):
-    loaded, errors = Policy.load(find_policy(policy)), []
-    for seed in range(2):
-        summary, fake, _ = throw(
-            make(policy, seed), seed=seed, policy=policy, loaded=loaded, seconds=5.5
-        )
-        true = fake.plant.landing["landing_w"]
-        assert true is not None, summary["reason"]
-        errors.append(np.hypot(true[0] - 2.0, true[1]))
-        (landing,) = summary["landings"]
-        assert norm(np.subtract(landing["landing_w"], true)) < READ_BACK
-        assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (
-            0,
-            1,
-            0,
-        )
-        assert summary["held_back"] == 0, "a right throw is not delayed"
-    assert np.mean(errors) < LANDING
+    summary, fake, _ = throw(make(policy, 0), policy=policy, seconds=5.5)
+    true = fake.plant.landing["landing_w"]
+    assert true is not None, summary["reason"]
+    assert np.hypot(true[0] - 2.0, true[1]) < LANDING
+    (landing,) = summary["landings"]
+    assert norm(np.subtract(landing["landing_w"], true)) < READ_BACK
+    assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (0, 1, 0)
+    assert summary["held_back"] == 0, "a right throw is not delayed"

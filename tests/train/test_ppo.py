@@ -241,7 +241,7 @@ def test_steps_become_ever_smaller():
     assert targets[12:] == approx([0.003] * 12)
 
 
-@mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(2))
 def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
     """At this rate the mean is 0.038 to 0.047 off, the last weights 0.074 to 0.137 (20 seeds)."""
     changes = ('schedule="fixed"', "learning_rate=0.01", "epochs=2")

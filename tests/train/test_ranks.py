@@ -83,7 +83,7 @@ def folder(tmp_path_factory):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["rsl_rl.env"])  # which takes longest, once for both
+    context.set_forkserver_preload(["visthrow.training.trainer"])  # once for both
     both = [
         context.Process(target=process, args=(rank, port, folder), daemon=True) for rank in range(2)
     ]

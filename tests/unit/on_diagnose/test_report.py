@@ -307,7 +307,7 @@ def test_where_nothing_was_named_no_error_with_names_is_given(found, measured):
     for theta in (found[1].theta, {}):
         (section,) = (
             s
-            for s in report.sections(replace(found[1], theta=theta), measured)
+            for s in report.sections(replace(found[1], theta=theta, work=None), measured)
             if s.title == "Gain on flights that were not used"
         )
         rows[bool(theta)] = section.parts[0].rows[0]
