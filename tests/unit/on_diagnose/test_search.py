@@ -438,6 +438,25 @@ def test_a_set_that_was_the_best_before_stays_possible():
     }
 
 
+def test_a_name_of_which_the_true_cause_leaves_nothing_is_dropped(monkeypatch):
+    """Derivatives from where a name stands in for the true cause may promise nothing but both
+    together, which may not be named.
+    """
+    model = SyntheticModel(truth={"effect_06": 15.0}, seed=4)
+    for w in model._windows:
+        w.effects[:, 8] = w.effects[:, 6] + w.effects[:, 3]
+    problem = Problem.of(model, model.windows({}), range(14))
+    selector = Selector(linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
+    by_name = {c.name: c for c in selector.candidates}
+    stand_in = frozenset({by_name["effect_08"]})
+    true = frozenset({by_name["effect_06"]})
+    (begin,) = selector._tried(selector.nominal, [stand_in])
+    selector._go(begin)
+    monkeypatch.setattr(selector, "_listed", lambda: {stand_in | true: 40.0})
+    assert selector._moved()
+    assert selector.best.chosen == true
+
+
 def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that
     hold it, stay a fifth too small.

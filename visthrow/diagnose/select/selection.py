@@ -23,6 +23,7 @@ from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.candidates import (
+    ALL,
     NOTHING,
     Names,
     columns_of,
@@ -170,8 +171,10 @@ class Selector:
         near: list[Trial] = []  # a trial's matrices are large: others are forgotten
         better: list[Trial] = []
         while chosen := self._next(listed, leads, least):
+            leads[chosen] = -np.inf
             tried = self._tried(self.best.point, [chosen])
-            leads[chosen] = max((t.lead for t in tried), default=-np.inf)
+            tried += self._tried(self.best.point, self._reduced(tried))
+            leads |= {t.chosen: t.lead for t in tried}
             possible = [t for t in tried if t.lead > -self._limit(t.chosen)]
             near += [t for t in possible if self.is_admissible(t)]
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
@@ -291,6 +294,19 @@ class Selector:
             self._simulated[s] = max(nats, self._simulated.get(s, -np.inf))
             trials.append(trial)
         return trials
+
+    def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
+        """Return those members of sets that are ahead, but may not be named, that are surely there.
+
+        Beside the true cause nothing is left of a name that stood in for it. What derivatives
+        promise without that name, from where it stood in, says little."""
+        reduced = []
+        for trial in tried:
+            if trial.lead > ENOUGH_NATS and not self.is_admissible(trial):
+                sure = {*trial.point.posterior.surely_there(trial.columns)}
+                members = (c for c in trial.chosen if c.group != ALL or sure.issuperset(c.columns))
+                reduced.append(frozenset(members))
+        return [s for s in reduced if s not in self._simulated]
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point, or one that was linearised with the kinds of blocks that a set asks
