@@ -17,7 +17,7 @@ import numpy as np
 
 from bench import start
 from bench.common_options import add_common
-from camera.detectors.contours import Detector, Prior, detected_keypoints
+from camera.detectors.contours import Detector, Prior, convert_to_training_keypoints
 from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
 from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
@@ -231,7 +231,7 @@ def counted(
                 begin = time.perf_counter()
                 detection = detector.detect(image, knows)
                 spent[name].append(time.perf_counter() - begin)
-                points, valid = detected_keypoints(
+                points, valid = convert_to_training_keypoints(
                     eyes, detection, rot_wc @ nominal_rot_cb(camera.mount).numpy()
                 )
                 off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)

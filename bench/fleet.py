@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Train, throw, print, write."""
     from visthrow.common.compute_device import resolve
     from visthrow.onboard.policy import Policy, find_policy
-    from visthrow.throws.loading import trained_in
+    from visthrow.throws.loading import training_experiment
 
     device = resolve(args.device)
     folder = Path(args.out)
@@ -67,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
     }
     policies = {name: Policy.load(path) for name, path in paths.items()}
     experiments = {
-        name: trained_in(policies[name], path, args.overrides) for name, path in paths.items()
+        name: training_experiment(policies[name], path, args.overrides)
+        for name, path in paths.items()
     }
     rivals = _rivals(next(iter(experiments.values())), args, folder / "rivals", device)
     for name, policy in policies.items():

@@ -20,11 +20,11 @@ from visthrow import config
 from visthrow.common.compute_device import resolve
 from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import HOVER, SWAY, Hovered, Spreads, solved, sway
+from visthrow.onboard.calibration import HOVER, SWAY, Hovered, Spreads, sway, try_calibration
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.task.measurement import hover_start
-from visthrow.throws.calibrated import calibrated_start
+from visthrow.throws.calibrated import start_calibrated
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 from visthrow.training.env import ThrowEnv
 
@@ -53,7 +53,7 @@ def in_training(
     with torch.inference_mode():
         env = ThrowEnv(flown, device, seed, count)
         env.fix_goal(torch.tensor(GOAL, device=device))
-        calibrated_start(flown, found)(env)
+        start_calibrated(flown, found)(env)
         return (
             found,
             env.view.buffers["extrinsic_rotation"].cpu().numpy(),
@@ -109,7 +109,7 @@ def on_reference(
         pose_bias=1e-4,
         keypoint_bias=1e-4,
     )
-    solve = partial(solved, camera=flown.camera, contract=contract_of(flown), spreads=told)
+    solve = partial(try_calibration, camera=flown.camera, contract=contract_of(flown), spreads=told)
     with Workers(solve, hovers, cores(), "calibrations") as workers:
         found = dict(workers)
     return [None if isinstance(found[i], str) else found[i] for i in range(count)], turn, scale

@@ -23,7 +23,7 @@ import torch
 from bench import start
 from bench.report import Report, Table, finish
 from bench.world_held import held_in_world
-from sim.effects.setting import Setting, generalised, specialised
+from sim.effects.setting import Setting, generalise, specialise
 from visthrow.common.arguments import add_option
 from visthrow.common.workers import status
 from visthrow.config.effects import catalogue
@@ -60,9 +60,9 @@ Point = dict[str, Any]
 def changed(experiment: Experiment, name: str, theta: float) -> Experiment:
     """Return the experiment with an effect of this size on its plant or camera."""
     plant = plant_of(experiment)
-    base = generalised(Setting(plant, experiment.sensing, camera=experiment.camera))
+    base = generalise(Setting(plant, experiment.sensing, camera=experiment.camera))
     setting = catalogue()[name].apply(base, theta)
-    new = specialised(setting.plant, plant)
+    new = specialise(setting.plant, plant)
     return dataclasses.replace(
         experiment,
         **{part: getattr(new, part) for part in ("vehicle", "rope", "release", "sim", "air")},
@@ -82,7 +82,7 @@ def thrown(experiment: Experiment, policy: Any) -> dict[str, float]:
 def sizes(name: str, experiment: Experiment) -> Iterator[tuple[int, list[float]]]:
     """Give the signs of an effect, each with sizes that grow to its bound."""
     effect = catalogue()[name]
-    base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
+    base = generalise(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     if not effect.applies(base) or effect.switch:
         return
     low, high = effect.bounded(base).bounds

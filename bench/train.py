@@ -53,9 +53,9 @@ def seconds(
     times = []
     function()
     if device.startswith("cuda"):
-        from sim.torch_bridge import captured
+        from sim.torch_bridge import capture_graph
 
-        function = captured(function).replay
+        function = capture_graph(function).replay
     for _ in range(repeats):
         before()
         settle()

@@ -72,14 +72,14 @@ def trained(trainer: Any, seconds: float) -> dict[str, Any]:
 
 def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
     """Throws at all targets, and at one with each fault."""
-    from visthrow.throws.loading import trained_in
+    from visthrow.throws.loading import training_experiment
     from visthrow.training import protocol
 
     policy = policy.to(device)
     rows = {}
     layout = policy.contract["observation"]["layout"]
     for name, (target, change) in conditions(layout).items():
-        flown = trained_in(policy, "policy", change)
+        flown = training_experiment(policy, "policy", change)
         throws = protocol.throw(flown, policy.actor(count), target, count, device, SEED)
         rows[name] = throws.summary()
     return rows

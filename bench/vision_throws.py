@@ -101,7 +101,7 @@ def thrown(
     """Throws of a row under one condition: mean and 95 % interval of the error, lowest and highest
     of the seeds, shares.
     """
-    from visthrow.throws.calibrated import calibrated_start
+    from visthrow.throws.calibrated import start_calibrated
     from visthrow.training.env import ThrowEnv
 
     loaded = load_policy(LOCATED if name == RIVAL else name, None, overrides)
@@ -109,7 +109,7 @@ def thrown(
     flown = loaded.policy
     if name == RIVAL:
         flown = Policy.load(find_policy(TOLD))
-    begin: Callable = calibrated_start(experiment) if calibrate else ThrowEnv.reset
+    begin: Callable = start_calibrated(experiment) if calibrate else ThrowEnv.reset
     each = []
     for seed in range(SEEDS):
         actor = Rival(experiment, flown, THROWS) if name == RIVAL else flown.actor(THROWS)

@@ -122,7 +122,7 @@ class Fisheye:
         shrink = self.radius_from_angle(theta.clip(max=self.half_fov) if clip else theta) / radius
         normalized = points_c[..., :2] * (shrink * (1.0 / self.edge_radius))[..., None]
         if not self.circle_inside_image:
-            valid = valid & self.on_sensor(self.denormalize(normalized))
+            valid = valid & self.is_on_sensor(self.denormalize(normalized))
         return normalized, valid
 
     def project(self, points_c: Array) -> tuple[Array, Array]:
@@ -133,7 +133,7 @@ class Fisheye:
 
         Returns:
             Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta
-            <= fov / 2. Whether a valid point also falls on the sensor is `on_sensor`'s to say.
+            <= fov / 2. Whether a valid point also falls on the sensor is `is_on_sensor`'s to say.
         """
         theta, radius, _ = self.angle(points_c)
         focal, centre = self._pixel_constants(points_c)
@@ -171,7 +171,7 @@ class Fisheye:
         focal, centre = self._pixel_constants(normalized)
         return normalized * (focal * self.edge_radius) + centre
 
-    def on_sensor(self, pixels: Array) -> Array:
+    def is_on_sensor(self, pixels: Array) -> Array:
         """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
         bool, shape (...).
         """

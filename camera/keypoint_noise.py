@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from camera.arrays import at_latency, latency_weights, push, redraw
-from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
+from camera.keypoints import KEYPOINTS, KeypointCamera, correct_keypoints, keypoints
 from camera.params import CameraParams, KeypointNoiseParams
 
 
@@ -162,4 +162,4 @@ class DetectorView:
             buffers["held_valid"].copy_(valid)
         if self.correction is None:
             return points, valid
-        return corrected_keypoints(self.camera, points, valid, *self.correction)
+        return correct_keypoints(self.camera, points, valid, *self.correction)

@@ -188,7 +188,7 @@ def box_midpoints(extremes: Array) -> Array:
     return middles.reshape(-1, 4, 2)
 
 
-def corrected_keypoints(
+def correct_keypoints(
     camera: KeypointCamera,
     points: Tensor,
     valid: Tensor,
@@ -271,10 +271,10 @@ def keypoints(
     marks_c = torch.cat([points_c[:, :4], rays_c], -2)
     projected, valid = camera.fisheye.project_normalized(marks_c, clip=True)
     points = torch.cat([projected[:, :4], box_midpoints(projected[:, 4:])], -2)
-    return by_rule(camera, points, valid)
+    return apply_invalid_rule(camera, points, valid)
 
 
-def by_rule(camera: KeypointCamera, points: Array, valid: Array) -> tuple[Array, Array]:
+def apply_invalid_rule(camera: KeypointCamera, points: Array, valid: Array) -> tuple[Array, Array]:
     """Apply ``invalid_reads`` to points that are clipped to the edge.
 
     Args:

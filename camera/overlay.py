@@ -67,7 +67,7 @@ def draw_overlay(
     return canvas
 
 
-def _fixed(points: ndarray) -> ndarray:
+def _to_fixed_point(points: ndarray) -> ndarray:
     """Pixels as OpenCV's fixed-point integers; far outside the image they are cut off before they
     overflow.
     """
@@ -78,10 +78,12 @@ def _draw_group(canvas, points, valid, outline, colour, thick) -> None:
     import cv2
 
     if valid.all():
-        cv2.polylines(canvas, [_fixed(outline)[:, None]], True, colour, 1, cv2.LINE_AA, SHIFT)
+        cv2.polylines(
+            canvas, [_to_fixed_point(outline)[:, None]], True, colour, 1, cv2.LINE_AA, SHIFT
+        )
     for point, ok in zip(points, valid, strict=True):
         if ok:
-            centre = tuple(map(int, _fixed(point)))
+            centre = tuple(map(int, _to_fixed_point(point)))
             cv2.circle(canvas, centre, (thick + 1) << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
         else:
             height, width = canvas.shape[:2]
@@ -100,7 +102,7 @@ def _draw_field_of_view(canvas, lens: Fisheye, thick: int) -> None:
     for radius, colour in ((quarter, (70, 70, 70)), (lens.edge_radius, GREY)):
         if radius <= lens.edge_radius:
             axes = (round(p.fx * radius * 2**SHIFT), round(p.fy * radius * 2**SHIFT))
-            centre = tuple(map(int, _fixed(np.array([p.cx, p.cy]))))
+            centre = tuple(map(int, _to_fixed_point(np.array([p.cx, p.cy]))))
             width = thick if colour == GREY else 1
             whole = (0, 0, 360)  # rotation, from, to [deg]
             cv2.ellipse(canvas, centre, axes, *whole, colour, width, cv2.LINE_AA, SHIFT)

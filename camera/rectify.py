@@ -58,7 +58,7 @@ def view_map(lens: Fisheye, view: ViewParams) -> tuple[Tensor, Tensor]:
     depth = torch.ones_like(plane[..., :1])
     rays = torch.cat([plane, depth], -1) @ view_rotation(view).T
     pixels, valid = lens.project(rays)
-    return pixels, valid & lens.on_sensor(pixels)
+    return pixels, valid & lens.is_on_sensor(pixels)
 
 
 def rectify(frames: Tensor, lens: Fisheye, view: ViewParams) -> Tensor:

@@ -218,10 +218,10 @@ class HybridSim:
         plants = pack_plants(self.types, params, vehicles, ropes, airs, releases)
         self._plants = plants_on(self.types, plants, params.sim, gravity, device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
-        self._exchange = self._exchanged(ropes)
+        self._exchange = self._make_exchange(ropes)
         self.place(pos_w=np.zeros((count, 3)))
 
-    def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
+    def _make_exchange(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
         """Return the solver of the plant's bodies with what it exchanges; None for the fused
         kernel.
         """

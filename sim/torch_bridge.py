@@ -52,7 +52,7 @@ def on_torch_stream(device: str):
     )
 
 
-def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
+def capture_graph(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
     """Return a CUDA graph of what ``work`` launches; ``options`` of `torch.cuda.graph`.
 
     Python collects no garbage meanwhile: an array or graph of Warp that it frees ends the capture.
@@ -87,7 +87,7 @@ class ReplayedGraph:
         self._stream.wait_stream(torch.cuda.current_stream())
         if self._graph is None and self._warm:
             # autograd and NCCL's watchdog use the device from other threads meanwhile
-            self._graph = captured(
+            self._graph = capture_graph(
                 self._work, stream=self._stream, capture_error_mode="thread_local"
             )
         with torch.cuda.stream(self._stream):

@@ -29,14 +29,14 @@ def run(args: argparse.Namespace) -> None:
     from visthrow.common.storage import write_json
     from visthrow.cooperative.team_command import load
     from visthrow.cooperative.team_training import throw
-    from visthrow.view.parts import aligned
+    from visthrow.view.parts import align
 
     experiment, policy, _ = load("pair", "tree")
     options = {"target": args.target, "count": args.throws, "seed": args.seed}
     row = throw(experiment, policy.act, **options)
     rows = [{"way": "both vehicles at once: pair", **row}, halves(args, experiment.rope)]
     heads = ("way", "throws", "mean error [m]", "95 % [m]", "until all has landed [s]", "landed")
-    print(aligned(heads, [cells(row) for row in rows], heads=1))
+    print(align(heads, [cells(row) for row in rows], heads=1))
     if args.json:
         write_json(args.json, rows)
 

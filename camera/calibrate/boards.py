@@ -188,7 +188,7 @@ def calibrate_from_boards(
             )
         views = [view for i in used if (view := boards[i]) is not None]
         try:
-            lens = _solved(views, width, height, fov_deg)
+            lens = _solve(views, width, height, fov_deg)
             fisheye = Fisheye(lens)
             residuals = [_residual(fisheye, view, board_pose(fisheye, view)) for view in views]
         except (cv2.error, ValueError) as error:
@@ -217,7 +217,7 @@ def _farthest(views: list[View], width: int, height: int) -> tuple[int, float]:
     return int(np.argmax(reach)), max(reach)
 
 
-def _solved(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:
+def _solve(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:
     """OpenCV's fisheye of boards; its field of view ends where it folds."""
     import cv2
 
@@ -310,7 +310,7 @@ def board_pose(lens: Fisheye, view: View) -> ndarray:
     return np.asarray(solution.x)
 
 
-def reprojected(lens: Fisheye, view: View) -> ndarray:
+def reproject(lens: Fisheye, view: View) -> ndarray:
     """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was
     fitted.
     """

@@ -248,7 +248,7 @@ def _has(node: Node, names: str) -> bool:
     return any(name in node for name in names.split()) or _find(node, names) is not None
 
 
-def _any(node: Node, names: str) -> Any:
+def _find_any(node: Node, names: str) -> Any:
     """Return what `_find` does; ValueError where none of the keys exists."""
     value = _find(node, names)
     if value is None:
@@ -279,7 +279,7 @@ def _number(node: Node, place: str) -> float:
     if place.replace(".", "").isdigit():
         return float(place)
     name = place.removesuffix("?")
-    value = _find(node, name) if name != place else _any(node, name)
+    value = _find(node, name) if name != place else _find_any(node, name)
     if value is None:
         return 0.0
     return _floats([value], name)[0]
@@ -291,7 +291,7 @@ def _values(node: Node, numbers: list[str]) -> Values:
     for spec in numbers:
         places, listed, names = spec.rpartition(": ")
         if listed:
-            cells = _floats(_any(node, places), places.split()[0], len(names.split()))
+            cells = _floats(_find_any(node, places), places.split()[0], len(names.split()))
             values |= dict(zip(names.split(), cells))
         else:
             for word in spec.split():
@@ -303,7 +303,7 @@ def _values(node: Node, numbers: list[str]) -> Values:
 
 def _label(node: Node, tool: Node) -> str:
     """Distortion model by whatever name a tool gives it."""
-    word = str(node.get("asked_model") or _any(node, tool["label"]))
+    word = str(node.get("asked_model") or _find_any(node, tool["label"]))
     plain = re.sub(r"[^a-z0-9]", "", word.lower())
     if not node.get("asked_model"):
         plain = tool.get("labels", {}).get(plain, plain)
@@ -374,16 +374,16 @@ def _camera(box: str, node: Node) -> Camera:
     if tool.get("terms"):
         coefficients = [_number(node, place) for place in places.split()]
     else:
-        coefficients = _floats(_any(node, places), places.split()[0])
+        coefficients = _floats(_find_any(node, places), places.split()[0])
     if box == "ros or opencv":
-        node = _labelled(node, len(coefficients))
+        node = _add_distortion_name(node, len(coefficients))
         coefficients += [0.0] * (4 - len(coefficients))
     elif box == "vikit" and values["fx"] < 10.0:
-        values = _unshared(values, _size(node) or (0, 0))
+        values = _pixels_of_shares(values, _size(node) or (0, 0))
     return _model(core, tool.get("distortion") or _label(node, tool), values, coefficients)
 
 
-def _labelled(node: Node, count: int) -> Node:
+def _add_distortion_name(node: Node, count: int) -> Node:
     """Return ROS' camera_info or OpenCV's FileStorage with the name of its distortion, which a flag
     or the number of coefficients may tell.
     """
@@ -400,7 +400,7 @@ def _labelled(node: Node, count: int) -> Node:
     )
 
 
-def _unshared(values: Values, size: tuple[int, int]) -> Values:
+def _pixels_of_shares(values: Values, size: tuple[int, int]) -> Values:
     """Return pixels for shares of the image, which count from its corner."""
     width, height = size
     pixels = {"fx": values["fx"] * width, "fy": values["fy"] * height}
@@ -470,7 +470,7 @@ def _lens(
     if node.get("fov_deg") is not None:
         fov = _floats([node["fov_deg"]], "fov_deg")[0]
     if model != "kb4" or values.get("skew", 0.0):
-        lens, report = _fitted(model, values, size, fov)
+        lens, report = _fit_lens(model, values, size, fov)
         return lens, replace(report, remarks=(*remarks, *report.remarks))
     fx, fy, cx, cy, k1, k2, k3, k4 = (values[name] for name in KB4.split())
     limit = math.degrees(monotonic_limit((k1, k2, k3, k4)))
@@ -486,7 +486,7 @@ def _lens(
     return lens, FitReport("kb4", remarks=tuple(remarks))
 
 
-def _fitted(
+def _fit_lens(
     model: str, values: Values, size: tuple[int, int], fov: float | None
 ) -> tuple[FisheyeParams, FitReport]:
     """Fit our lens; ocam's polynomial needs to know how far the image reaches."""

@@ -230,7 +230,9 @@ def fit_fisheye(
             f"the image of this {model} lens shows {len(theta)} of {ANGLES * TURNS} rays that were"
             " tried; expected a principal point and focal lengths that lie in the image"
         )
-    parameters = _fitted(theta, direction, pixels, np.array([values["cx"], values["cy"]]), values)
+    parameters = _fit_radial(
+        theta, direction, pixels, np.array([values["cx"], values["cy"]]), values
+    )
     error = np.linalg.norm(_project_ours(parameters, theta, direction) - pixels, axis=1)
     coefficients = tuple(float(k) for k in parameters[4:])
     folds = min(limit, monotonic_limit(coefficients) * (1.0 - 1e-9))
@@ -258,7 +260,9 @@ def _project_ours(unknown: Array, theta: Array, direction: Array) -> Array:
     return direction * radius[:, None] * unknown[:2] + unknown[2:4]
 
 
-def _fitted(theta: Array, direction: Array, pixels: Array, centre: Array, values: Values) -> Array:
+def _fit_radial(
+    theta: Array, direction: Array, pixels: Array, centre: Array, values: Values
+) -> Array:
     """fx, fy, cx, cy, k1 to k4; every angle off the axis counts alike."""
     from scipy.optimize import least_squares
 

@@ -6,8 +6,8 @@ blob of the goal's hue is the goal if its edges are four straight lines in the t
 rays, with a bright rim around. Edges are found to a fraction of a pixel where the colour has fallen
 to half its level just inside, so that blur moves them little.
 
-The result is rays, not pixels: `detected_keypoints` makes of them what the training lens would have
-shown, by the functions that training calls."""
+The result is rays, not pixels: `convert_to_training_keypoints` makes of them what the training lens
+would have shown, by the functions that training calls."""
 
 import math
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from camera.keypoints import (
     GOAL_KEYPOINTS,
     PAYLOAD_KEYPOINTS,
     KeypointCamera,
-    by_rule,
+    apply_invalid_rule,
     payload_keypoints,
 )
 
@@ -172,7 +172,7 @@ class Detector:
         """
         best = self._best_cone(circles_of(mask), level, prior)
         if best is None and prior.ball_ray_c is not None:
-            return self._expected(level, prior)
+            return self._find_expected_ball(level, prior)
         return best
 
     def _best_cone(
@@ -181,7 +181,7 @@ class Detector:
         best: BallSeen | None = None
         for centre, radius in circles:
             cone = self._cone(level, centre, radius)
-            if cone is None or not self._in_place(cone.ray_c, cone.half_angle, prior):
+            if cone is None or not self._is_in_place(cone.ray_c, cone.half_angle, prior):
                 continue
             score = cone.score
             if prior.ball_ray_c is not None:
@@ -191,7 +191,7 @@ class Detector:
                 best = BallSeen(cone.ray_c, cone.half_angle, score)
         return best
 
-    def _expected(self, level: ndarray, prior: Prior) -> BallSeen | None:
+    def _find_expected_ball(self, level: ndarray, prior: Prior) -> BallSeen | None:
         """A ball on a ground or beside a thing that has its colour too, about where it
         is expected.
         """
@@ -236,7 +236,7 @@ class Detector:
             radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
         return best
 
-    def _in_place(self, ray: ndarray, half_angle: float, prior: Prior) -> bool:
+    def _is_in_place(self, ray: ndarray, half_angle: float, prior: Prior) -> bool:
         """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
         distance = self.radius / max(math.sin(half_angle), 1e-9)
         low, high = prior.ball_distance or self.params.ball_distance
@@ -276,7 +276,7 @@ class Detector:
         return bool(np.all(np.abs(sides / self.side - 1.0) < self.params.side_tolerance))
 
 
-def ordered_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
+def order_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
     """Corners in the order of `camera.keypoints.goal_square`, by where they lie on the ground.
 
     Args:
@@ -298,7 +298,7 @@ def ordered_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
     return rays_c[best]
 
 
-def detected_keypoints(
+def convert_to_training_keypoints(
     camera: KeypointCamera, detections: FrameDetections, rot_wb: ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of the training camera from what was seen, by the functions that training calls.
@@ -321,7 +321,7 @@ def detected_keypoints(
     valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)
     if detections.goal is not None:
         rot_wc = rot_wb @ camera.rot_cb.double().numpy().T
-        rays = ordered_corners(detections.goal.rays_c, rot_wc)
+        rays = order_corners(detections.goal.rays_c, rot_wc)
         corners, ok = camera.fisheye.project_normalized(torch.from_numpy(rays).float(), clip=True)
         points[:GOAL_KEYPOINTS] = corners
         valid[:GOAL_KEYPOINTS] = ok
@@ -331,5 +331,5 @@ def detected_keypoints(
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
         points[GOAL_KEYPOINTS:] = box[0]
         valid[GOAL_KEYPOINTS:] = ok[0]
-    points, valid = by_rule(camera, points[None], valid[None])
+    points, valid = apply_invalid_rule(camera, points[None], valid[None])
     return points[0], valid[0]

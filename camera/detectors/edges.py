@@ -135,7 +135,7 @@ def polar_edge(level: ndarray, centre: ndarray, radius: float) -> tuple[ndarray,
     angle = 2.0 * math.pi * np.arange(ANGLES) / ANGLES
     way = np.column_stack([np.cos(angle), np.sin(angle)])
     u, v = (centre[i] + way[:, i, None] * reach for i in range(2))
-    hit, distance = _last_crossing(_sample(level, u, v), reach)
+    hit, distance = _find_last_crossing(_sample(level, u, v), reach)
     points = centre + way * distance[:, None]
     return points[hit], float(hit.mean())
 
@@ -206,11 +206,11 @@ def fit_goal(
         return None  # as wide as the whole view
     corners = _quadrangle((local[:, :2] / local[:, 2:]).astype(np.float32))
     for _ in range(2):  # the second time from better corners
-        refined = None if corners is None else _refined(lens, corners, frame, level)
+        refined = None if corners is None else _refine_corners(lens, corners, frame, level)
         if refined is None:
             return None
         corners, misfit, share = refined
-    outer = _scaled(corners, 1.0 / field_share)
+    outer = _scale_square(corners, 1.0 / field_share)
     rim = _rim_contrast(lens, corners, frame, bright, field_share)
     if misfit > MOST_BENT or share < 0.5 or rim < LEAST_RIM:
         return None
@@ -241,7 +241,7 @@ def _quadrangle(points: ndarray) -> ndarray | None:
     return corners[np.argsort(np.arctan2(off[:, 1], off[:, 0]))]
 
 
-def _refined(
+def _refine_corners(
     lens: Fisheye, corners: ndarray, frame: ndarray, level: ndarray
 ) -> tuple[ndarray, float, float] | None:
     """Corners by lines through the edges near each side; with the misfit over the side's length and
@@ -268,7 +268,7 @@ def _refined(
         reach = np.linspace(0.0, 1.0, max(8, steps))
         u, v = (start[:, i, None] + way[:, i, None] * reach for i in range(2))
         values = _sample(level, u, v)
-        hit, distance = _first_crossing(values, reach)
+        hit, distance = _find_first_crossing(values, reach)
         if hit.sum() < SIDE_SAMPLES // 3:
             return None
         edge = rays_of(lens, start[hit] + way[hit] * distance[hit, None]) @ frame
@@ -306,7 +306,7 @@ def _meet(first: ndarray, second: ndarray) -> ndarray:
     return np.linalg.solve(matrix, [first[2], second[2]])
 
 
-def _scaled(corners: ndarray, factor: float) -> ndarray:
+def _scale_square(corners: ndarray, factor: float) -> ndarray:
     """Corners of a square about its centre made larger, as the perspective that shows it has it."""
     import cv2
 
@@ -327,7 +327,7 @@ def _rim_contrast(
     part = np.linspace(0.15, 0.85, 8)[:, None]
 
     def around(factor: float) -> ndarray:
-        ring = _scaled(corners, factor)
+        ring = _scale_square(corners, factor)
         sides = np.roll(ring, -1, axis=0) - ring
         points = (ring[:, None] + part * sides[:, None]).reshape(-1, 2)
         pixels = _pixels(lens, points, frame)
@@ -351,7 +351,7 @@ def _pixels(lens: Fisheye, plane: ndarray, frame: ndarray) -> ndarray | None:
     """
     rays = np.column_stack([plane, np.ones(len(plane))]) @ frame.T
     pixels, valid = lens.project(torch.from_numpy(rays))
-    if bool((valid & lens.on_sensor(pixels)).all()):
+    if bool((valid & lens.is_on_sensor(pixels)).all()):
         return pixels.numpy()
     return None
 
@@ -382,7 +382,7 @@ def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
     return values.reshape(u.shape)
 
 
-def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
+def _find_last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     """Outermost fall of each row from the level just inside to that just outside; whether there is
     one, and where.
 
@@ -391,7 +391,7 @@ def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     plateau = np.quantile(values, 0.75, axis=1)
     threshold = 0.4 * plateau
     falls = _falls(values, threshold)
-    last = _last(falls)
+    last = _index_of_last(falls)
     hit = falls.any(axis=1) & (plateau > LEAST_LEVEL) & (values[:, -1] <= threshold)
     start = round(BLUR_WIDTH / STEP)
     rows = np.arange(len(values))[:, None]
@@ -404,13 +404,13 @@ def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     window = np.clip(last + np.arange(-2 * start, 2 * start + 1), 0, peak)
     level = low + RIM_LEVEL * (high - low)
     falls = _falls(values[rows, window], level)
-    index = _last(falls)
+    index = _index_of_last(falls)
     hit &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
     place = np.minimum(window[rows[:, 0], index], peak - 1)
     return hit, _between(values, reach, place, level)
 
 
-def _first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
+def _find_first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     """First fall of each row through half of its level at the start; whether there is one, and
     where.
     """
@@ -427,7 +427,7 @@ def _falls(values: ndarray, level: ndarray) -> ndarray:
     return above[:, :-1] & ~above[:, 1:]
 
 
-def _last(marks: ndarray) -> ndarray:
+def _index_of_last(marks: ndarray) -> ndarray:
     """Index of the last mark of each row."""
     return marks.shape[1] - 1 - np.argmax(marks[:, ::-1], axis=1)
 

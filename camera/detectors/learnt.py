@@ -147,7 +147,7 @@ class Networks(nn.Module):
         return networks.eval()
 
 
-def halved(frames: Tensor) -> Tensor:
+def halve(frames: Tensor) -> Tensor:
     """Frames as the search sees them:
 
     RGB in -1 to 1, (B, 3, H / 2, W / 2), of uint8 (B, H, W, 3).
@@ -250,7 +250,7 @@ class LearntDetector(Detector):
         self.check(image)
         prior = prior or Prior()
         frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
-        places = places_of(self.networks.search(halved(frames)), self.lens)
+        places = places_of(self.networks.search(halve(frames)), self.lens)
         north_c = (0.0, -1.0, 0.0) if prior.north_c is None else prior.north_c
         north = torch.tensor(north_c, dtype=torch.float32)
         ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
@@ -274,11 +274,11 @@ class LearntDetector(Detector):
 
     def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:
         expected = (prior.ball_ray_c, prior.ball_within)
-        probability = self._raised_near(probability, things[:, :3], *expected)
+        probability = self._raise_near(probability, things[:, :3], *expected)
         for i in probability.argsort(descending=True).tolist():
             ray = things[i, :3].double().numpy()
             half_angle = float(things[i, 3])
-            if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, prior):
+            if probability[i] >= LEAST_PROBABILITY and self._is_in_place(ray, half_angle, prior):
                 return BallSeen(ray, half_angle, float(probability[i]))
         return None
 
@@ -288,7 +288,7 @@ class LearntDetector(Detector):
         """
         middles = F.normalize(things.mean(1), dim=-1)
         expected = (prior.goal_ray_c, prior.goal_within)
-        raised = self._raised_near(probability, middles, *expected)
+        raised = self._raise_near(probability, middles, *expected)
         squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
@@ -297,7 +297,7 @@ class LearntDetector(Detector):
                 squares.append(GoalSeen(rays, float(probability[i])))
         return tuple(squares)
 
-    def _raised_near(
+    def _raise_near(
         self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, tolerance: float
     ) -> Tensor:
         """Probabilities where it is known about where the thing is; the networks' own are of a

@@ -42,7 +42,7 @@ class CalibrationSolver:
     """Estimates calibrations in a process of its own, which starts before the flight."""
 
     def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> None:
-        """Start the process; arguments as of `visthrow.onboard.calibration.solved`."""
+        """Start the process; arguments as of `visthrow.onboard.calibration.try_calibration`."""
         self._conditions = camera, contract, spreads
         self._pool = ProcessPoolExecutor(1, get_context("spawn"))
         self._pool.submit(_warm).result()
@@ -50,7 +50,7 @@ class CalibrationSolver:
 
     def submit(self, hovered: Hovered) -> None:
         """Begin to estimate; `poll` returns the result."""
-        self._result = self._pool.submit(calibration.solved, hovered, *self._conditions)
+        self._result = self._pool.submit(calibration.try_calibration, hovered, *self._conditions)
 
     def poll(self) -> Calibration | str | None:
         """Return a new result, or why there is none, once; None while there is nothing new."""

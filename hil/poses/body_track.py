@@ -9,7 +9,7 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
-from visthrow.common.rotations import plus, turned_one
+from visthrow.common.rotations import plus, turn_one
 
 # poses are carried forward by no more than this [s]; older ones are the timers' affair
 MOST_PREDICTION = 0.1
@@ -153,7 +153,7 @@ class Track:
             pos = plus(pos, vel, lead)
             vel = plus(vel, self.filter.acceleration, TRUST * lead)
             if quat is not None:
-                quat = turned_one(quat, rate, lead)
+                quat = turn_one(quat, rate, lead)
             if self._turns:
                 rate = plus(rate, self.filter.spin, TRUST * lead)
         return BodyState(pos, quat, vel, rate, age)

@@ -11,7 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from camera.detectors.contours import BallSeen, FrameDetections, GoalSeen, detected_keypoints
+from camera.detectors.contours import (
+    BallSeen,
+    FrameDetections,
+    GoalSeen,
+    convert_to_training_keypoints,
+)
 from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
 from camera.mount import rotation_from_vector
 from hil.poses.pose import Quaternion, Vector
@@ -100,7 +105,7 @@ class Detections:
         rot_wb = matrix_of_quat(np.array(quat))
         if self._turn is not None and self._path:
             frame = self._carried(frame, detection.stamp - self._latency + aged)
-        points, valid = detected_keypoints(self._camera, frame, rot_wb)
+        points, valid = convert_to_training_keypoints(self._camera, frame, rot_wb)
         self.fresh = detection.stamp, points.numpy(), valid.numpy()
         if detection.stamp <= self._newest:
             return

@@ -24,7 +24,7 @@ from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, serve
 from visthrow import config
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
@@ -48,7 +48,7 @@ BALL_LAG = 0.06
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    declared(__file__)(parser)
+    declare(__file__)(parser)
     parser.set_defaults(after=AFTER_LANDING)
     parser.epilog = examples("fake")
 

@@ -17,14 +17,16 @@ RELAX = 1.0 / (2.0 * math.pi * 15.0)
 LONGEST_OFFSET = 0.12
 
 
-def _with(setting: Setting, values: dict[str, Any]) -> Setting:
+def _replace_in_vehicle(setting: Setting, values: dict[str, Any]) -> Setting:
     """Return a setting with other values of its vehicle."""
     return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
 
 
 def _lagging(setting: Setting) -> Setting:
     tau = setting.plant.vehicle.motor.time_constant
-    return _with(setting, {"motor.kind": "asymmetric", "motor.time_constant_down": tau})
+    return _replace_in_vehicle(
+        setting, {"motor.kind": "asymmetric", "motor.time_constant_down": tau}
+    )
 
 
 def _kind(block: str, *kinds: str) -> Callable[[Setting], bool]:
@@ -47,7 +49,9 @@ def _motor_mixing(setting: Setting) -> Setting:
         "feedforward_gain": (0.0, 0.0, 0.0),
         "calibration_voltage": plant.vehicle.battery.reference_voltage,
     }
-    return _with(setting, {f"controller.{name}": value for name, value in controller.items()})
+    return _replace_in_vehicle(
+        setting, {f"controller.{name}": value for name, value in controller.items()}
+    )
 
 
 CONDITIONS: dict[str, Callable[[Setting], bool]] = {
@@ -76,11 +80,11 @@ CONDITIONS: dict[str, Callable[[Setting], bool]] = {
 """Name -> whether a setting has what an effect changes."""
 
 SWITCHES: dict[str, Callable[[Setting], Setting]] = {
-    "PID controller": lambda s: _with(s, {"controller.kind": "betaflight"}),
+    "PID controller": lambda s: _replace_in_vehicle(s, {"controller.kind": "betaflight"}),
     "motor mixing": _motor_mixing,
-    "proportional controller": lambda s: _with(s, {"controller.kind": "geometric"}),
+    "proportional controller": lambda s: _replace_in_vehicle(s, {"controller.kind": "geometric"}),
     "motor lag": _lagging,
-    "no motor lag": lambda s: _with(s, {"motor.kind": "instant"}),
+    "no motor lag": lambda s: _replace_in_vehicle(s, {"motor.kind": "instant"}),
     "flexible rope": lambda s: changed(s, {"plant.rope.segments": SEGMENTS}),
     "rigid rope": lambda s: changed(s, {"plant.rope.segments": 1}),
 }

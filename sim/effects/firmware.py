@@ -47,7 +47,7 @@ def numbers(settings: Mapping[str, str], name: str, default: str = "0") -> list[
     return [float(word) for word in settings.get(name, default).split(",")]
 
 
-def left_out(settings: Mapping[str, str]) -> list[str]:
+def missing_features(settings: Mapping[str, str]) -> list[str]:
     """List the firmware's features under these settings that the block lacks."""
     features = []
     for name, does in NOT_SAID.items():

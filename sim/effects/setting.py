@@ -34,7 +34,7 @@ class Setting:
     camera: Any = None
 
 
-def generalised(setting: Setting) -> Setting:
+def generalise(setting: Setting) -> Setting:
     """Return the same plant in the kinds of block that have most numbers.
 
     A plant without aerodynamics becomes one with zero coefficients, a first-order motor one of two
@@ -50,7 +50,7 @@ def generalised(setting: Setting) -> Setting:
     return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
 
 
-def specialised(plant: PlantParams, before: PlantParams) -> PlantParams:
+def specialise(plant: PlantParams, before: PlantParams) -> PlantParams:
     """Return the plant with the kinds that it had before it was generalised, wherever they still
     say the same.
     """

@@ -61,7 +61,7 @@ class Units:
         return Units(1.0 / self.length, 1.0 / self.mass)
 
 
-def in_units(
+def convert_units(
     value: Value, units: Units, dimensions: Mapping[str, Mapping[str, Dimension]] = PLANT
 ) -> Value:
     """Dataclass of SI values with its numbers stated in other units, tables in it too.
@@ -77,7 +77,7 @@ def in_units(
 
     def stated(name: str, item: Any) -> Any:
         if dataclasses.is_dataclass(item) and not isinstance(item, type):
-            return in_units(item, units, dimensions)
+            return convert_units(item, units, dimensions)
         if item == ():
             return item
         if name not in dimension_of:

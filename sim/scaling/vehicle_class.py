@@ -19,7 +19,7 @@ import numpy as np
 
 from camera.field_bounds import BoundedFields, Positive
 from sim.params import GRAVITY, PlantParams, VehicleParams, changed
-from sim.scaling.units import Units, in_units
+from sim.scaling.units import Units, convert_units
 
 Range = tuple[float, float]
 
@@ -108,8 +108,8 @@ def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
     ratio = nominal.vehicle.body.mass / x["mass"]
     # in these units the known vehicle has the mass that was drawn
     alike = Units(ratio ** (1 / 3), ratio)
-    usual = in_units(nominal.vehicle, alike)
-    rope = in_units(nominal.rope, alike)
+    usual = convert_units(nominal.vehicle, alike)
+    rope = convert_units(nominal.rope, alike)
     vehicle = _vehicle(usual, x)
     if fleet.yaw_loop is not None:
         vehicle = _calm(vehicle, fleet.yaw_loop * yaw_rate(usual) / yaw_rate(vehicle))
@@ -119,7 +119,7 @@ def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
     return replace(
         nominal,
         vehicle=vehicle,
-        rope=replace(rope, **_multiplied(rope, "rope", x)),
+        rope=replace(rope, **_multiply(rope, "rope", x)),
         release=replace(nominal.release, lag=x["lag"]),
     )
 
@@ -155,7 +155,7 @@ def _product(factors: str, x: Mapping[str, float]) -> float:
     return product
 
 
-def _multiplied(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any]:
+def _multiply(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any]:
     """Return the numbers of a dataclass that a table of :data:`SCALES` names, times its factors."""
     values: dict[str, Any] = {}
     for path, factors in SCALES[table].items():
@@ -168,7 +168,7 @@ def _multiplied(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
     """Return a vehicle with the factors drawn."""
-    values = _multiplied(v, "vehicle", x)
+    values = _multiply(v, "vehicle", x)
     for path, factors in SCALES["yaw"].items():
         *level, about_z = values[path]
         values[path] = (*level, about_z * _product(factors, x))

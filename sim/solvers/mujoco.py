@@ -64,7 +64,7 @@ class MujocoSolver:
             for name, value in arrays.items()
             if value.size and (name == "body_mass" or (value != value[0]).any())
         }
-        make = _on_cpu if device == "cpu" else _on_gpu
+        make = _make_on_cpu if device == "cpu" else _make_on_gpu
         self.qpos, self.qvel, self.ctrl, self._masses, self._step, self._placed = make(
             models[0], wide, count, device
         )
@@ -99,7 +99,7 @@ class MujocoSolver:
         w.launch(self._kernels["show"], outputs)
 
 
-def _on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
+def _make_on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
     """Batch of MuJoCo's C library: arrays of coordinates, controls and masses, functions that step
     and that take over what was placed where a mask is not 0.
     """
@@ -129,8 +129,8 @@ def _on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
     return qpos, qvel, ctrl, masses, step, placed
 
 
-def _on_gpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
-    """MuJoCo Warp's worlds: see :func:`_on_cpu`."""
+def _make_on_gpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
+    """MuJoCo Warp's worlds: see :func:`_make_on_cpu`."""
     import mujoco_warp
 
     with wp.ScopedDevice(device), wp.ScopedStream(wp.Stream(device)):

@@ -32,7 +32,7 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
         if not ball:
             box = last.add_body(name="box", pos=end)
             add_joints(box, rope.segments, "universal", rope.joint_damping)
-            _as_box(box, rope, -rope.payload_offset)
+            _set_box_inertia(box, rope, -rope.payload_offset)
         if rope.gripper_mass > 0.0:
             gripper = last.add_body(name="gripper", pos=end)
             set_inertial(gripper, rope.gripper_mass, 0.0, (GRIPPER_INERTIA,) * 3)
@@ -51,7 +51,7 @@ def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: Rope
     x, y, z = rope.mount
     box = spec.worldbody.add_body(name="box", pos=[x, y, z - rope.length - rope.payload_offset])
     box.add_freejoint(name="box")
-    _as_box(box, rope, 0.0)
+    _set_box_inertia(box, rope, 0.0)
     for name, side in (("front", 0.5), ("rear", -0.5)):
         offset = side * rope.cables_apart
         vehicle.add_site(name=f"{name}_above", pos=[x + offset, y, z])
@@ -63,7 +63,7 @@ def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: Rope
         cable.wrap_site(f"{name}_below")
 
 
-def _as_box(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
+def _set_box_inertia(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
     """Give a body a homogeneous box's inertia about a centre on its z axis, and the site
     ``payload`` there.
     """

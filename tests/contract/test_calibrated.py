@@ -7,12 +7,12 @@ import torch
 from pytest import mark, raises
 from torch.testing import assert_close
 
-from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
+from camera.keypoints import KeypointCamera, correct_keypoints, keypoints
 from camera.mount import rotation_from_vector
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
 from visthrow.task.measurement import hover_start
-from visthrow.throws.calibrated import calibrated_start
+from visthrow.throws.calibrated import start_calibrated
 from visthrow.training.env import ThrowEnv
 
 
@@ -31,7 +31,7 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
     seen, valid = keypoints(
         camera, pos, rot, goal, load, camera.extrinsics(turn, torch.zeros(8, 3))
     )
-    got, left = corrected_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
+    got, left = correct_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
     assert left.all()
     assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
     assert_close(got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3)  # a box is upright in each image
@@ -41,7 +41,7 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
 @mark.parametrize("change", ['task.observation.layout="state"', "task.target.speed=[0.1,0.2]"])
 def test_what_cannot_be_calibrated_is_refused(change):
     with raises(ConfigError, match="calibration in the hover"):
-        calibrated_start(experiment(change))
+        start_calibrated(experiment(change))
 
 
 def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
@@ -54,7 +54,7 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
     with torch.inference_mode():
         env, found = ThrowEnv(flown, "cpu", 0, 4), []
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
-        calibrated_start(flown, found)(env)
+        start_calibrated(flown, found)(env)
         turn, scale = (
             env.view.buffers["extrinsic_rotation"].numpy(),
             env.view.buffers["scale_error"].flatten().numpy(),

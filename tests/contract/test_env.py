@@ -178,4 +178,4 @@ def test_commands_and_their_inverse():
     assert edge.tolist() == [[14.0, 10.0, -10.0, 4.0], [0.0, 0.0, 0.0, 0.0]]
     hover = torch.tensor([actions.hover_action(2.7, 14.0)])
     assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == approx(2.7, rel=1e-5)
-    assert not actions.release_asked(hover, 0.95).item()
+    assert not actions.wants_release(hover, 0.95).item()

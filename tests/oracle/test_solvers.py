@@ -20,7 +20,7 @@ from pytest import approx, importorskip, mark, param, raises
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, LawParams, PlantParams, changed
-from sim.solvers.mujoco import _on_gpu
+from sim.solvers.mujoco import _make_on_gpu
 from tests.configs import load_experiment
 from tests.contract.test_simulator_bits import assert_same, state_of
 from tests.plants import EVERYTHING, SCENES, paper_plant
@@ -312,6 +312,6 @@ def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch
     for name in ("ScopedDevice", "ScopedStream", "ScopedCapture", "Stream", "synchronize_device"):
         capture = contextlib.nullcontext(SimpleNamespace(graph=None))
         monkeypatch.setattr(wp, name, lambda *_, _made=capture, **__: _made)
-    parts = _on_gpu(None, {}, 1, "cuda:0")
+    parts = _make_on_gpu(None, {}, 1, "cuda:0")
     gc.collect()
     assert made[0]() is not None, parts

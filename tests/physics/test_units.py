@@ -9,7 +9,7 @@ from pytest import mark, raises
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
-from sim.scaling.units import Units, in_units
+from sim.scaling.units import Units, convert_units
 from tests.configs import load_experiment
 from tests.plants import EVERYTHING
 from visthrow.task import TaskParams, plant_of
@@ -86,16 +86,16 @@ def test_a_plant_in_other_units_flies_the_same_flight(kind):
     p = plant()
     vehicle = replace(p.vehicle, controller=replace(p.vehicle.controller, kind=kind))
     p = replace(p, vehicle=vehicle)
-    usual, other = flown(p, Units(1.0, 1.0)), flown(in_units(p, UNITS), UNITS)
+    usual, other = flown(p, Units(1.0, 1.0)), flown(convert_units(p, UNITS), UNITS)
     for name, value in usual.items():
         np.testing.assert_allclose(other[name], value, rtol=ROUNDING, atol=ROUNDING, err_msg=name)
 
 
 def test_every_field_of_plant_and_task_has_a_dimension():
     task = load_experiment("any").task
-    assert isinstance(in_units(task, UNITS, TASK), TaskParams)
+    assert isinstance(convert_units(task, UNITS, TASK), TaskParams)
     missing = (
         r"control_period has no dimension; .*dimensions.toml, table \[SimParams\], under .*time"
     )
     with raises(ValueError, match=missing):
-        in_units(plant().sim, UNITS, {})
+        convert_units(plant().sim, UNITS, {})

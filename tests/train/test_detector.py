@@ -13,7 +13,7 @@ from pytest import mark
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from tests.commands import run_command, set_words
-from visthrow.cli.fly import _rendered_eyes
+from visthrow.cli.fly import _make_rendered_eyes
 from visthrow.detector_training.eyes import RenderedEyes
 from visthrow.detector_training.scenes.scene import Nuisances
 from visthrow.task import load_experiment
@@ -97,7 +97,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
 
 def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):
     loaded = load_policy("vision")
-    eyes, (now, goal) = _rendered_eyes(loaded, "contours", 3), hanging()
+    eyes, (now, goal) = _make_rendered_eyes(loaded, "contours", 3), hanging()
     eyes.look(now, now, goal, np.array([True]))
     sheet = cv2.imread(str(eyes.sheet(tmp_path / "pixels.png")))
     lens = loaded.experiment.camera.fisheye

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write, writable, write_json
@@ -68,22 +68,22 @@ def _landings(entry: Entry, throws: Any) -> tuple[str, np.ndarray]:
     return entry.name, throws.landing_w[throws.success] - (throws.target, 0.0)
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
     if args.runs:
-        return _from_runs(args)
+        return _compare_runs(args)
     check(args.targets, args.throws)
     for name in args.policies or ():
         if name != BASELINE:
             find_policy(name)  # said before anything heavy is imported
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy, unique_names
-    from visthrow.throws.plants import known_plant
+    from visthrow.throws.plants import check_plant
 
-    known_plant(args.plant)
+    check_plant(args.plant)
     if args.calibrate and args.plant != "hybrid":
         raise ConfigError(
             f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from"
@@ -135,7 +135,7 @@ def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str
     return 0
 
 
-def _from_runs(args: argparse.Namespace) -> int:
+def _compare_runs(args: argparse.Namespace) -> int:
     """Print and write the table of the throws in folders of HIL runs; ConfigError where policies
     were named as well.
     """
@@ -189,10 +189,10 @@ def throw_hybrid(
     """Throw in the training simulator, after a calibration in the hover where asked; for each
     policy a `Throws` a target.
     """
-    from visthrow.throws.calibrated import calibrated_start
+    from visthrow.throws.calibrated import start_calibrated
 
     # A policy that cannot be calibrated is refused before the simulator is imported.
-    starts = [calibrated_start(item.experiment) if calibrate else None for item in loaded]
+    starts = [start_calibrated(item.experiment) if calibrate else None for item in loaded]
     from visthrow.training.env import ThrowEnv
     from visthrow.training.protocol import throw
 

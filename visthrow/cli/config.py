@@ -3,11 +3,11 @@
 import argparse
 
 from visthrow import config
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError
 from visthrow.config import kinds
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from visthrow.cli import compare, fly
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 
@@ -18,7 +18,7 @@ REFERENCE_TARGETS = (2.0,)  # [m]
 SEED = 0
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
                 " than training ...",
                 flush=True,
             )
-            paths += _tabled(loaded, throwing.results(), "reference-realistic", folder)
+            paths += _write_table(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
         print(f"  {path}")
@@ -73,7 +73,7 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
     paths = fly.write(folder, log, loaded[1].experiment)
     print(fly.summary_text(log) + "\n")
     print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
-    return paths + _tabled(
+    return paths + _write_table(
         loaded,
         compare.throw_hybrid(loaded, compare.DEFAULT_TARGETS, throws, "cpu", SEED),
         "hybrid",
@@ -81,7 +81,7 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
     )
 
 
-def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
+def _write_table(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
     entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
     comparison = compare.on_plant(plant, SEED, entries)

@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import check_place, writable, write_json
@@ -18,7 +18,7 @@ FILES = {
 }
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
-    eyes = None if args.pixels is None else _rendered_eyes(loaded, args.pixels, args.seed)
+    eyes = None if args.pixels is None else _make_rendered_eyes(loaded, args.pixels, args.seed)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
     if eyes is not None:
@@ -69,9 +69,9 @@ def run(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     """Raise ConfigError for arguments that no flight follows."""
     from visthrow.logs.export import FORMATS
-    from visthrow.throws.plants import known_plant
+    from visthrow.throws.plants import check_plant
 
-    known_plant(args.plant)
+    check_plant(args.plant)
     formats = FORMATS | {".mcap": ("mcap.writer", "recordings")}
     if len(args.target) > 2:
         raise ConfigError(
@@ -108,7 +108,7 @@ def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
     return 0
 
 
-def _rendered_eyes(loaded, method: str, seed: int):
+def _make_rendered_eyes(loaded, method: str, seed: int):
     """Return a detector on rendered pictures for a vision policy."""
     rendered = load_extra("visthrow.detector_training.eyes", "detector", "--pixels", ConfigError)
     if loaded.policy.contract["observation"]["layout"] != "vision":

@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

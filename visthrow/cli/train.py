@@ -5,9 +5,9 @@ checkpoints, resume.
 import argparse
 from dataclasses import fields
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -28,7 +28,9 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
-def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callable[[str], float]:
+def checked_number(
+    kind: type, good: Callable[[float], bool], expected: str
+) -> Callable[[str], float]:
     """Return what reads a number of the command line that must be good."""
 
     def parse(text: str) -> float:
@@ -40,10 +42,10 @@ def checked(kind: type, good: Callable[[float], bool], expected: str) -> Callabl
     return parse
 
 
-NUMBER = checked(float, math.isfinite, "a finite number")
-ABOVE_ZERO = checked(float, lambda x: 0.0 < x < math.inf, "a number above 0")
-WHOLE = checked(int, lambda x: x >= 0, "a whole number of 0 or more")
-PORT = checked(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
+NUMBER = checked_number(float, math.isfinite, "a finite number")
+ABOVE_ZERO = checked_number(float, lambda x: 0.0 < x < math.inf, "a number above 0")
+WHOLE = checked_number(int, lambda x: x >= 0, "a whole number of 0 or more")
+PORT = checked_number(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
 
 
 TYPES: Mapping[str, Callable[[str], Any]] = {
@@ -92,7 +94,7 @@ def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None
             add_table(action, actions.add_parser(name, formatter_class=form, **texts))
 
 
-def declared(module: str) -> Callable[[argparse.ArgumentParser], None]:
+def declare(module: str) -> Callable[[argparse.ArgumentParser], None]:
     """Return a command's ``add_arguments``: its table in the ``commands.toml`` beside its module,
     named as that is.
     """

@@ -137,7 +137,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def turned_one(quat: Quaternion, rate_b: Vector, time: float) -> Quaternion:
+def turn_one(quat: Quaternion, rate_b: Vector, time: float) -> Quaternion:
     """Return a single attitude after a short time [s] at body rates [rad/s]."""
     half = 0.5 * time
     turn = multiply(quat, (*(half * r for r in rate_b), 1.0))

@@ -42,7 +42,7 @@ class Interval:
         return f"{form.format(self.value)} [{form.format(self.low)}, {form.format(self.high)}]"
 
 
-def _resampled(groups: list[ndarray], rng: np.random.Generator, draws: int) -> ndarray:
+def _resample(groups: list[ndarray], rng: np.random.Generator, draws: int) -> ndarray:
     """Means of bootstrap samples, shape (draws, ...): runs drawn first, then throws within each."""
     count = len(groups)
     # means of resampled throws, for each run as many independent ones as it can be drawn
@@ -61,7 +61,7 @@ def _resampled(groups: list[ndarray], rng: np.random.Generator, draws: int) -> n
     return stacked[index, chosen, np.arange(count)[None]].mean(1)
 
 
-def _checked(groups: Groups | ndarray) -> list[ndarray]:
+def _require_throws(groups: Groups | ndarray) -> list[ndarray]:
     """List of runs that have throws; ValueError where there is nothing to average."""
     listed = [groups] if isinstance(groups, ndarray) else list(groups)
     groups_with_data = [np.asarray(group, dtype=float) for group in listed if len(group)]
@@ -88,25 +88,27 @@ def mean(groups: Groups | ndarray, seed: int = 0, draws: int = DRAWS) -> Interva
     """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so
     many bootstrap samples.
     """
-    groups_with_data = _checked(groups)
-    samples = _resampled(groups_with_data, np.random.default_rng(seed), draws)
+    groups_with_data = _require_throws(groups)
+    samples = _resample(groups_with_data, np.random.default_rng(seed), draws)
     return _interval(_mean(groups_with_data), samples)
 
 
 def difference(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` minus mean of ``b``, independent throws."""
-    return _of_both(np.subtract, a, b, draws)
+    return _compare_both(np.subtract, a, b, draws)
 
 
-def _of_both(function: np.ufunc, a: Groups | ndarray, b: Groups | ndarray, draws: int) -> Interval:
-    first = _checked(a)
-    second = _checked(b)
+def _compare_both(
+    function: np.ufunc, a: Groups | ndarray, b: Groups | ndarray, draws: int
+) -> Interval:
+    first = _require_throws(a)
+    second = _require_throws(b)
     rng = np.random.default_rng(0)
-    samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
+    samples = function(_resample(first, rng, draws), _resample(second, rng, draws))
     return _interval(function(_mean(first), _mean(second)), samples)
 
 
-def paired(a: ndarray, b: ndarray) -> Interval:
+def compare_pairs(a: ndarray, b: ndarray) -> Interval:
     """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a
     failed throw are left out.
 
@@ -118,7 +120,7 @@ def paired(a: ndarray, b: ndarray) -> Interval:
 
 def ratio(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` over mean of ``b``, independent throws; both positive."""
-    return _of_both(np.divide, a, b, draws)
+    return _compare_both(np.divide, a, b, draws)
 
 
 def correlation(x: ndarray, y: ndarray) -> Interval:
@@ -175,8 +177,8 @@ def bias(groups: Groups | ndarray) -> Bias:
 
     Mean square = offset squared + scatter squared.
     """
-    groups_with_data = _checked(groups)
-    samples = _resampled(groups_with_data, np.random.default_rng(0), DRAWS)
+    groups_with_data = _require_throws(groups)
+    samples = _resample(groups_with_data, np.random.default_rng(0), DRAWS)
     center = _mean(groups_with_data)
     square = float(np.mean([(group**2).sum(1).mean() for group in groups_with_data]))
     offset = float(np.hypot(*center))

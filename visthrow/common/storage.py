@@ -88,7 +88,7 @@ def write_json(path: str | Path, value: Any) -> None:
     """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has
     neither.
     """
-    atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
+    atomic_write(path, json.dumps(_replace_nan(value), indent=2, allow_nan=False) + "\n")
 
 
 def savez(path: str | Path, arrays: dict[str, ndarray]) -> None:
@@ -131,7 +131,7 @@ def unpack(path: str | Path, open_: Callable[..., IO[bytes]], error: type[Except
         return file.read()
 
 
-def counted(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
+def count_lines(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
     """Yield lines of a text of a length, and say on standard error how far that is."""
     begin = time.monotonic()
     done = 0
@@ -185,11 +185,11 @@ def from_json_array(array: ndarray) -> Any:
     return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
 
 
-def _without_nan(value: Any) -> Any:
+def _replace_nan(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _without_nan(item) for key, item in value.items()}
+        return {str(key): _replace_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
+        return [_replace_nan(item) for item in value]
     if isinstance(value, np.generic | ndarray):
-        return _without_nan(value.tolist())
+        return _replace_nan(value.tolist())
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -45,17 +45,17 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     Returns:
         The filled dataclass.
     """
-    return _built(schema, _read(schema, Path(path), ()), overrides)
+    return _build(schema, _read(schema, Path(path), ()), overrides)
 
 
 def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
     """Load TOML text, which messages call by a name, as :func:`load` does a file; includes are
     looked up under the root.
     """
-    return _built(schema, _parse(schema, text, name, configs_root(), ()), overrides)
+    return _build(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
 
-def _built(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
+def _build(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
     overrides = tuple(overrides)
     for override in overrides:
         _override(schema, tree, override)
@@ -127,7 +127,7 @@ def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
 
 def dumps(config: Any) -> str:
     """Write a config as TOML that loads back to an equal config."""
-    return toml_text.dumps(without_none(to_dict(config)))
+    return toml_text.dumps(spell_none(to_dict(config)))
 
 
 def _is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
@@ -146,13 +146,13 @@ def _plain(value: Any, defaults: bool) -> Any:
     return value
 
 
-def without_none(value: Any) -> Any:
+def spell_none(value: Any) -> Any:
     """Return nested values with the word that stands for None in TOML in its place."""
     if value is None:
         return NONE_WORD
     if isinstance(value, dict):
-        return {key: without_none(item) for key, item in value.items()}
-    return [without_none(item) for item in value] if isinstance(value, list) else value
+        return {key: spell_none(item) for key, item in value.items()}
+    return [spell_none(item) for item in value] if isinstance(value, list) else value
 
 
 def _display_path(path: Path) -> str:

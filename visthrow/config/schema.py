@@ -184,7 +184,7 @@ def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | Con
                 fail(
                     item.source,
                     _join(_join(path, key), "name"),
-                    f"got {_described(base_name)}; expected the heading, {key!r}",
+                    f"got {_describe(base_name)}; expected the heading, {key!r}",
                 )
             table.items["name"] = Leaf(key, item.source)
         base = item.items.get(BASE_KEY)
@@ -192,7 +192,7 @@ def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | Con
             return table
         siblings = {k for k, v in node.items.items() if isinstance(v, ConfigTable)} - {key, *above}
         if not isinstance(base, Leaf) or base.value not in siblings:
-            value = _described(base)
+            value = _describe(base)
             problem = f"got {value}; expected another table; {suggest(value, siblings)}"
             fail(item.source, _join(_join(path, key), BASE_KEY), problem)
         return merged(row(base.value, (key, *above)), table)
@@ -200,7 +200,7 @@ def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | Con
     return {key: row(key, ()) for key in node.items}
 
 
-def _described(node: Leaf | ConfigTable) -> str:
+def _describe(node: Leaf | ConfigTable) -> str:
     return repr(node.value) if isinstance(node, Leaf) else "a table"
 
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 
 POLICIES = ("pair", "pair_vision")
 """Shipped policies, each with the configuration of its name in ``configs/cooperative``."""
@@ -12,7 +12,7 @@ POLICIES = ("pair", "pair_vision")
 SHIPPED = Path(__file__).with_name("policies")
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,7 +31,7 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
     from visthrow.common.extras import load_extra
     from visthrow.cooperative.team import TeamExperiment, team_contract
     from visthrow.onboard.policy import Policy
-    from visthrow.throws.loading import trained_in
+    from visthrow.throws.loading import training_experiment
 
     file = Path(name)
     if not file.is_file():
@@ -47,7 +47,7 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
         changes = ["rope.segments=15"]
         module = "visthrow.cooperative.referee"
         build = load_extra(module, "reference", "--solver mujoco", VisthrowError).MujocoTeam
-    experiment = trained_in(policy, file, changes, TeamExperiment)
+    experiment = training_experiment(policy, file, changes, TeamExperiment)
     policy.require(team_contract(experiment), allow=("team", "rope"))
     return experiment, policy, build
 
@@ -79,7 +79,7 @@ def _compare(args: argparse.Namespace) -> int:
     from visthrow.common.storage import write_json
     from visthrow.cooperative.team import FAULTS
     from visthrow.cooperative.team_training import throw
-    from visthrow.view.parts import aligned
+    from visthrow.view.parts import align
 
     rows = []
     cells = []
@@ -91,7 +91,7 @@ def _compare(args: argparse.Namespace) -> int:
             rows.append({"policy": name, "solver": args.solver, **row})
             cells.append(_cells(rows[-1]))
     heads = "policy | fault | throws | error [m] | 95 % [m] | duration [s] | landed | contact"
-    print(aligned(heads.split(" | "), cells, heads=2))
+    print(align(heads.split(" | "), cells, heads=2))
     if args.json:
         write_json(args.json, rows)
     return 0

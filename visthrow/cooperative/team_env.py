@@ -97,13 +97,13 @@ class TeamEnv(VecEnv):
         self._rate_weights = like.new_tensor(task.reward.rate_command)
         self._change_weights = like.new_tensor(task.reward.command_change)
         self.episode_length_buf = like.new_zeros(self.rows, dtype=torch.long)
-        self._memory = self._remembered(like)
+        self._memory = self._carried_buffers(like)
         self.earliest = like.new_zeros((), dtype=torch.long)
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
 
-    def _remembered(self, like: Tensor) -> dict[str, Tensor]:
+    def _carried_buffers(self, like: Tensor) -> dict[str, Tensor]:
         """The buffers that an episode carries beside the simulator's state."""
         rows = self.rows
         worlds = self.worlds
@@ -136,7 +136,7 @@ class TeamEnv(VecEnv):
         """Values of rows as (W, V, ...)."""
         return of_rows.unflatten(0, (self.worlds, self.team))
 
-    def _joined(self, of_rows: Tensor) -> Tensor:
+    def _join(self, of_rows: Tensor) -> Tensor:
         """Values of rows, a line an actor: of all members side by side where one flies them all."""
         return of_rows.reshape(self.num_envs, -1).float()
 
@@ -184,8 +184,8 @@ class TeamEnv(VecEnv):
         self._start(done)
         rows = self._rows(done)
         self._observations = self._observe(rows)
-        paid = self._joined(reward).mean(1)
-        return self._observations, paid, self._joined(rows).amax(1), {}
+        paid = self._join(reward).mean(1)
+        return self._observations, paid, self._join(rows).amax(1), {}
 
     def _apply(self, actions: Tensor) -> Tensor:
         """Fly one control period; returns the clipped actions.
@@ -199,7 +199,7 @@ class TeamEnv(VecEnv):
         noisy = action[:, : act.COMMANDS] + noise + memory["command_bias"]
         command = act.command_from_action(noisy, task.action.max_thrust, self._max_rate)
         self.views.command.copy_(command)
-        requests = self._worlds(act.release_asked(actions, self.cfg.release.threshold)).all(1)
+        requests = self._worlds(act.wants_release(actions, self.cfg.release.threshold)).all(1)
         requests &= self.episode_length_buf[:: self.team] >= self.earliest
         fresh = torch.zeros_like(requests)
         memory["requests"].copy_(arrays.push(memory["requests"], requests.float(), fresh))
@@ -236,7 +236,7 @@ class TeamEnv(VecEnv):
             gaps.append(torch.where(self._neighbour(attached, k), cable - reach, 10.0))
         return self._worlds(torch.stack(gaps).amin(0)).amin(1)
 
-    def _landed(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def _handle_landings(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Worlds whose last vehicle has let go in this step, and what follows from it."""
         out = self.views.out
         memory = self._memory
@@ -274,7 +274,7 @@ class TeamEnv(VecEnv):
         release = self.cfg.release
         time = self.episode_length_buf * period
         load = self._rows(self.load_w)
-        released, landing = self._landed(time[:: self.team])
+        released, landing = self._handle_landings(time[:: self.team])
         gap = self.gap()
         contact = (gap < 0.0) & ~released
         turn = ob.rotation_from_quat(state["quat_wb"])
@@ -290,7 +290,7 @@ class TeamEnv(VecEnv):
         attached = rewards.kinetic(p, state["vel_w"], state["rate_b"], load_vel)
         attached = attached + rewards.command(p, action, self._rate_weights)
         attached = attached + rewards.change(p, action, previous, self._change_weights)
-        at_release = rewards.at_release(
+        at_release = rewards.release_reward(
             p, error, landing["time_to_impact"], landing["clearance"], release.clearance_margin
         )
         shared = rewards.carry_time(p, period) - p.termination * negative.float()
@@ -399,8 +399,8 @@ class TeamEnv(VecEnv):
             setup=messages,
         )
         memory["history"].copy_(history)
-        critic = self._privileged(vehicle, load, attached, fresh)
-        observed = {"actor": self._joined(actor), "critic": self._joined(critic)}
+        critic = self._critic_view(vehicle, load, attached, fresh)
+        observed = {"actor": self._join(actor), "critic": self._join(critic)}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
     def _messages(self, poses: Tensor, pos_w: Tensor) -> Tensor:
@@ -418,7 +418,9 @@ class TeamEnv(VecEnv):
         tripped = self._rows(self._memory["tripped"])
         return torch.cat([*parts, torch.stack([age, tripped], -1)], -1)
 
-    def _privileged(self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor) -> Tensor:
+    def _critic_view(
+        self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor
+    ) -> Tensor:
         """Critic's view."""
         state = self.views.state
         memory = self._memory

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from visthrow import config
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import VisthrowError
 
@@ -23,7 +23,7 @@ CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "learnt.npz"
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,10 +38,10 @@ def throw(args: argparse.Namespace) -> int:
     from visthrow.common.workers import done
     from visthrow.task.measurement import Throws
     from visthrow.throws.loading import load_policy
-    from visthrow.throws.plants import known_plant
+    from visthrow.throws.plants import check_plant
     from visthrow.throws.reference_protocol import plan
 
-    known_plant(args.plant)
+    check_plant(args.plant)
     loaded = load_policy(args.policy, None, args.overrides)
     if (
         min(args.throws, args.jobs) < 1
@@ -56,7 +56,7 @@ def throw(args: argparse.Namespace) -> int:
         "nuisances": args.nuisances,
     }
     jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
-    flown = dict(done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs))
+    flown = dict(done(partial(_throw_batch, loaded, args.plant, looks), jobs, args.jobs))
     throws, counters = zip(*(flown[i] for i in range(len(jobs))))
     columns = {name: np.concatenate([part[name] for part in throws]) for name in throws[0]}
     counts = {name: sum(part[name] for part in counters) for name in counters[0]}
@@ -81,7 +81,7 @@ def throw(args: argparse.Namespace) -> int:
     return 0
 
 
-def _thrown(
+def _throw_batch(
     loaded, plant: str, looks: dict[str, Any], job
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     """Throws of one batch, in halls of their own, and what was found in how many frames."""

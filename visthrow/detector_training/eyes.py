@@ -12,7 +12,7 @@ import torch
 from numpy import ndarray
 from torch import Tensor
 
-from camera.detectors.contours import Detector, FrameDetections, detected_keypoints
+from camera.detectors.contours import Detector, FrameDetections, convert_to_training_keypoints
 from camera.detectors.following import BallGoalTracker
 from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
@@ -21,7 +21,13 @@ from camera.params import CameraParams
 from sim.params import RopeParams
 from visthrow.common.storage import atomic_write
 from visthrow.detector_training.scenes.renderer import Renderer
-from visthrow.detector_training.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
+from visthrow.detector_training.scenes.scene import (
+    Draw,
+    Nuisances,
+    Scenes,
+    draw_halls,
+    make_plain_scenes,
+)
 from visthrow.detector_training.scenes.textures import HELD_OUT, photographs
 from visthrow.onboard.observations import rotation_from_quat
 
@@ -49,7 +55,7 @@ def render_hall(
     Returns a picture, BGR, uint8, shape (H, W, 3).
     """
     places = (place[None] for place in (pos_w, rot_wb, ball_w, goal_w))
-    scenes = posed_scenes(params, *places, torch.tensor([True]))
+    scenes = make_plain_scenes(params, *places, torch.tensor([True]))
     picture = Renderer(params.fisheye, files=[], samples=samples).render(scenes)[0].numpy()
     return np.ascontiguousarray(picture[..., ::-1])
 
@@ -139,10 +145,10 @@ class RenderedEyes:
             self._followed = [self._hanging(rot) for rot in rots]
         for e in range(self.count):
             picture = np.ascontiguousarray(pictures[e, ..., ::-1])
-            detections = self._looked(
+            detections = self._detect(
                 picture, e, measured.pos_w[e], rots[e], bool(carried[e]), float(measured.time)
             )
-            one, ok = detected_keypoints(self.camera, detections, rots[e])
+            one, ok = convert_to_training_keypoints(self.camera, detections, rots[e])
             points[e] = one.numpy()
             valid[e] = ok.numpy()
             if e == 0 and self._keep:
@@ -169,7 +175,7 @@ class RenderedEyes:
             self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below]
         )
 
-    def _looked(
+    def _detect(
         self,
         picture: ndarray,
         e: int,
@@ -210,7 +216,7 @@ class RenderedEyes:
         """Return the halls with vehicles, balls and squares where they are."""
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
         rot = rotation_from_quat(tensor(snapshot.quat_wb))
-        plain = posed_scenes(
+        plain = make_plain_scenes(
             self.params,
             tensor(snapshot.pos_w),
             rot,
@@ -218,7 +224,7 @@ class RenderedEyes:
             tensor(goal_w),
             torch.from_numpy(carried),
         )
-        hall = self._hall = self._hall or dressed(
+        hall = self._hall = self._hall or draw_halls(
             plain, Draw(*self._draw), self.renderer.textures, self._nuisances
         )
         rate = tensor(snapshot.rate_b)

@@ -30,7 +30,7 @@ from camera.detectors.learnt import (
     Networks,
     Views,
     corners_of,
-    halved,
+    halve,
     log_size,
     look_closely,
     patches_of,
@@ -108,7 +108,7 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Ten
     return labels.to(device)
 
 
-def other_lens(lens, generator: torch.Generator):
+def draw_lens(lens, generator: torch.Generator):
     """Return a lens like this one with another scale and a bend, its picture of the same size."""
     scale = (1.0 + 0.35 * torch.rand(1, generator=generator)).item()
     bend = (0.06 * torch.rand(1, generator=generator) - 0.04).item()
@@ -121,7 +121,7 @@ def other_lens(lens, generator: torch.Generator):
     )
 
 
-def rendered(
+def render_frames(
     camera: CameraParams, renderer: Renderer, count: int, seed: int
 ) -> tuple[Tensor, TensorDict, Fisheye]:
     """Frames of random scenes, their labels and their lens."""
@@ -286,7 +286,7 @@ class Fit:
         chosen = torch.randperm(len(frames), generator=host)[: p.batch].to(self.device)
         frames = frames[chosen]
         labels = labels[chosen]
-        grids = self.networks.search(self.augment(halved(frames)))
+        grids = self.networks.search(self.augment(halve(frames)))
         losses = {"search": search_loss(grids, labels, lens)}
         for k, kind in enumerate(KINDS):
             peaks = _peaks(grids[:, k].detach(), lens)
@@ -307,8 +307,8 @@ class Fit:
         generator = torch.Generator().manual_seed(seed)
         lens = self.camera.fisheye
         if torch.rand(1, generator=generator).item() < p.lenses:
-            lens = other_lens(lens, generator)
-        return rendered(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
+            lens = draw_lens(lens, generator)
+        return render_frames(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
 
     def look_loss(
         self, kind: str, frames: Tensor, labels: TensorDict, lens: Fisheye, places, generator
@@ -400,7 +400,9 @@ class Fit:
         total = self.params.calibration
         for first in range(0, total, 16):
             count = min(16, total - first)
-            frames, labels, lens = rendered(self.camera, self.renderer, count, 900_000_001 + first)
+            frames, labels, lens = render_frames(
+                self.camera, self.renderer, count, 900_000_001 + first
+            )
             for e in range(count):
                 one = labels[e : e + 1]
                 scores = findings(self.networks, frames[e : e + 1], one, lens)
@@ -432,7 +434,7 @@ def findings(
     """Score the places of one frame: logit, whether it is of the thing, error [rad], predicted
     accuracy [rad]; a row each.
     """
-    places = places_of(networks.search(halved(frame)), lens)
+    places = places_of(networks.search(halve(frame)), lens)
     scores = {}
     for kind in KINDS:
         rays, sizes = places[kind]

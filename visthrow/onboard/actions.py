@@ -48,7 +48,7 @@ def action_from_command(command: Tensor, max_thrust: float, max_rate: Tensor) ->
     return torch.cat([2.0 * throttle - 1.0, (command[:, 1:] / max_rate).clamp(-1.0, 1.0)], dim=-1)
 
 
-def release_asked(action: Array, threshold: float) -> Array:
+def wants_release(action: Array, threshold: float) -> Array:
     """Whether the latch trips: the fifth output above the threshold, bool, shape (E,)."""
     return action[:, COMMANDS] > threshold
 

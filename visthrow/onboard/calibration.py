@@ -282,7 +282,7 @@ class CalibrationProblem:
         rot = self.base @ rotation_from_vector(turn)
         rate = self.rate - c["gyro"][:, None]
         rope, rope_rate = _rope(swing, swing_rate)
-        hung = vel + _turned(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
+        hung = vel + _rotate(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
         longer = 1.0 + c["length"][:, None]
         ball, swung = (hung + size * longer * rope_rate for size in (self.length, self.swung))
         mean = lambda value: 0.5 * (value[:, :-1] + value[:, 1:])  # noqa: E731
@@ -306,7 +306,7 @@ class CalibrationProblem:
         inverse = rot[:, :-1].mT
         turned = _vector(inverse @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
         off = (
-            _turned(inverse, momentum) / self.push,
+            _rotate(inverse, momentum) / self.push,
             perpendicular[..., :2] / s.pendulum,
             (jump(pos) - mean(vel) * dt) / 1e-4,
             (jump(swing) - mean(swing_rate) * dt) / 2e-4,
@@ -343,7 +343,7 @@ class CalibrationProblem:
         leaning = _cubic(swing, swing_rate, j, u, dt)
         rope, _ = _rope(leaning, torch.zeros_like(leaning))
         length = self.length * (1.0 + c["length"][:, None])
-        ball_w = body_w + _turned(attitude, self.mount.expand_as(body_w)) + length * rope
+        ball_w = body_w + _rotate(attitude, self.mount.expand_as(body_w)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
         corners_w = goal_corners_w(goal_w, self.camera.square_w)
         corners_w = corners_w[:, None].expand(-1, body_w.shape[1], -1, -1)
@@ -387,7 +387,7 @@ def _means(values: Tensor) -> Tensor:
     return torch.cat([chord[:1], inner, chord[-1:]])
 
 
-def _turned(rot: Tensor, vector: Tensor) -> Tensor:
+def _rotate(rot: Tensor, vector: Tensor) -> Tensor:
     """Vectors turned by rotations of the same batch."""
     return (rot @ vector.unsqueeze(-1)).squeeze(-1)
 
@@ -438,7 +438,7 @@ def calibrate(
     x, c = problem.start()
     for _ in range(ROUNDS):
         try:
-            factor, gradient, misfit = _linearised(problem, x, c)
+            factor, gradient, misfit = _linearise(problem, x, c)
         except RuntimeError as error:  # of a factorisation
             raise CalibrationError(f"{NO_ANSWER}: {error}") from error
         step = torch.cholesky_solve(-gradient[:, None], factor)[:, 0]
@@ -473,7 +473,7 @@ def calibrate(
     )
 
 
-def solved(
+def try_calibration(
     hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None
 ) -> Calibration | str:
     """Return the calibration of a hover, as :func:`calibrate` finds it, or why there is none: a
@@ -485,7 +485,7 @@ def solved(
         return str(error)
 
 
-def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tensor, Tensor, float]:
+def _linearise(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tensor, Tensor, float]:
     """Cholesky factor of the normal equations about unknowns, the gradient there, and the misfit of
     the sightings.
 

@@ -88,7 +88,7 @@ class Estimator:
         return named
 
     @classmethod
-    def of_parts(cls, parts: Mapping[str, Tensor]) -> "Estimator":
+    def from_parts(cls, parts: Mapping[str, Tensor]) -> "Estimator":
         """Build from what :meth:`parts` gave. Raises PolicyError: one is missing."""
         names = [field.name for field in fields(cls)[:-1]]
         count = sum(name.startswith("inner") and name.endswith("_weight") for name in parts)

@@ -88,7 +88,7 @@ def place(sums: Array, time: Array, velocity: Array | None = None) -> Array:
     return mean + velocity * (time[:, None] - sums[:, 1:2] / total) * (sums[:, :1] > 0.0)
 
 
-def measured_goal(
+def measure_goal(
     layout: Layout, frame: Array, valid: Array | None, camera: KeypointCamera | None
 ) -> tuple[Array, Array]:
     """Goal in the world as one frame shows it.
@@ -135,7 +135,7 @@ def goal_by_corner(
     """Goal in the world as each corner of one vision frame shows it.
 
     Args:
-        frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame, shape (E,
+        frame, valid, camera: as of :func:`measure_goal`. rot_wb: attitude in the frame, shape (E,
             3, 3).
         rays: to the corners, shape (E, 4, 3), world frame.
 
@@ -154,7 +154,7 @@ def goal_by_corner(
 
 
 class GoalEstimate(NamedTuple):
-    """The sums that :func:`fitted_goal` adds for a frame."""
+    """The sums that :func:`update_goal_fit` adds for a frame."""
 
     sums: Array
     velocity: Array  # of the goal [m/s], shape (E, 2), where the layout has it
@@ -163,7 +163,7 @@ class GoalEstimate(NamedTuple):
     valid: Array
 
 
-def fitted_goal(
+def update_goal_fit(
     layout: Layout,
     frame: Array,
     valid: Array | None,
@@ -172,19 +172,19 @@ def fitted_goal(
     time: Array,
     fresh: Array,
 ) -> GoalEstimate:
-    """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
+    """Take one frame into the goal's fit; arguments as of :func:`measure_goal` and :func:`fit`."""
     if layout.name == "state" or not layout.located:
-        sums, velocity = fit(sums, time, *measured_goal(layout, frame, valid, camera), fresh)
+        sums, velocity = fit(sums, time, *measure_goal(layout, frame, valid, camera), fresh)
         moves = velocity if layout.motion else None
         if layout.located:
             places = place(sums, time, moves) - frame[:, :2]
         else:
             places = None
         return GoalEstimate(sums, moves, places, frame, valid)
-    return _located(layout, frame, valid, camera, sums, time, fresh)
+    return _update_located(layout, frame, valid, camera, sums, time, fresh)
 
 
-def _located(
+def _update_located(
     layout: Layout,
     frame: Array,
     valid: Array,
@@ -193,8 +193,8 @@ def _located(
     time: Array,
     fresh: Array,
 ) -> GoalEstimate:
-    """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box
-    a wrong one is outvoted.
+    """:func:`update_goal_fit` where the layout says where keypoints lie: of four points of goal
+    or box a wrong one is outvoted.
 
     The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the
     goal is known, 1; world frame. What is not known is 0."""
@@ -233,7 +233,7 @@ def predicted(
     would be seen.
 
     Args:
-        layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame,
+        layout, frame, valid, camera: as of :func:`measure_goal`. rot_wb: attitude in the frame,
             shape (E, 3, 3).
         goal_xy: goal by the steps so far [m], shape (E, 2), world frame. is_known: whether one has
             seen it, bool, shape (E, 1).

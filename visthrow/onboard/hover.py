@@ -96,7 +96,7 @@ class HoverController:
         rot_wb = matrix_of_quat(np.asarray(quat_wb, dtype=float))
         thrust_w = self._acceleration(pos_w, vel_w, goal_w)
         thrust_w[:, 2] += GRAVITY
-        thrust_w = _tilt_limited(thrust_w, params.max_tilt)
+        thrust_w = _limit_tilt(thrust_w, params.max_tilt)
         # Projected on where the vehicle's thrust points now: while it still turns, none is spent
         # sideways.
         thrust = np.asarray(mass) * np.sum(thrust_w * rot_wb[:, :, 2], axis=1)
@@ -126,7 +126,7 @@ class HoverController:
         return acceleration_w
 
 
-def _tilt_limited(thrust_w: ndarray, max_tilt: float) -> ndarray:
+def _limit_tilt(thrust_w: ndarray, max_tilt: float) -> ndarray:
     """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad]
     from the vertical.
     """

@@ -136,7 +136,7 @@ def joined(parts: list[Array]) -> Array:
     return library(parts[0]).concatenate(parts, -1)
 
 
-def resampled(history: Array, newest: Array, ages: list[float], period: float) -> Array:
+def resample(history: Array, newest: Array, ages: list[float], period: float) -> Array:
     """Histories as they would be if a step had come each period before now, by straight lines
     between those that came.
 
@@ -166,7 +166,7 @@ def resampled(history: Array, newest: Array, ages: list[float], period: float) -
 
 @lru_cache
 @torch.inference_mode(False)
-def _of_rotation(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
+def _rotation_terms(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
     """Which products of quaternion entries make the entries of the matrix, two each, their signs,
     and what they add to.
     """
@@ -180,7 +180,7 @@ def _of_rotation(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
 
 def rotation_from_quat(quat: Array) -> Array:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
-    chosen, signs, identity = _of_rotation(library(quat), quat.device, quat.dtype)
+    chosen, signs, identity = _rotation_terms(library(quat), quat.device, quat.dtype)
     products = quat[..., None] * (quat + quat)[..., None, :]  # of all pairs at once
     terms = products.reshape(*quat.shape[:-1], 16)[..., chosen] * signs
     rot_wb = identity + (terms[..., :9] + terms[..., 9:])

@@ -212,13 +212,13 @@ class Pilot:
         begin = time.perf_counter()
         goal_w = np.asarray(goal_w).reshape(-1, 3)
         attached = np.asarray(attached).reshape(-1, 1)
-        views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
+        views = self._stack_measurements(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
         detected = None
         if keypoints is not None:  # copies: a detector may reuse its arrays
             detected = tuple(self._native(np.array(array)) for array in keypoints)
         self._shown = views, detected
         inputs = self._see(views, detected)
-        if now is not None and self._bridged(now, inputs):
+        if now is not None and self._bridge_gap(now, inputs):
             inputs = self._see(views, detected)
         self._history = inputs.history
         self._answers = inputs.answers
@@ -227,7 +227,7 @@ class Pilot:
         raw, self._memory = self._network.step(inputs.observation, self._memory)
         action = act.clip_action(raw)
         command = act.command_from_action(action, self._max_thrust, self._max_rate)
-        release = act.release_asked(raw, self._threshold)
+        release = act.wants_release(raw, self._threshold)
         self._unasked = self._previous[:, 4]
         self._previous = np.asarray(action)
         self._fresh = self._zeros(self.count) > 0.0
@@ -250,7 +250,7 @@ class Pilot:
         if self._shown:
             self._network.step(self._see(*self._shown).observation, self._memory)
 
-    def not_released(self) -> None:
+    def cancel_release(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of
         none, as in training.
         """
@@ -265,7 +265,7 @@ class Pilot:
     def _zeros(self, *shape: int) -> Array:
         return self._native(np.zeros(shape, dtype=np.float32))
 
-    def _bridged(self, timestamp: float, inputs: PolicyInput) -> bool:
+    def _bridge_gap(self, timestamp: float, inputs: PolicyInput) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps
         before this one were late or missing.
 
@@ -285,15 +285,15 @@ class Pilot:
         errors = [abs(time - when) for time, when in zip(times, due)]
         late = len(due) != len(times) or any(error > JITTER for error in errors)
         if late:
-            self._history = ob.resampled(self._history, inputs.history[:, 0], ages, period)
+            self._history = ob.resample(self._history, inputs.history[:, 0], ages, period)
             if self.layout.response:
-                self._answers = ob.resampled(self._answers, inputs.answers[:, 0], ages, period)
+                self._answers = ob.resample(self._answers, inputs.answers[:, 0], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
         self._times = (timestamp, *times[: rows - 1])
         return late
 
-    def _measured(self, *views: ndarray | bool) -> list[Array]:
+    def _stack_measurements(self, *views: ndarray | bool) -> list[Array]:
         """Return the measurements of one step in the order of :data:`VIEWS`, float32, E rows each.
 
         Raises ValueError: one of another shape.
@@ -342,7 +342,7 @@ class Pilot:
         velocity = places = earlier = None
         if layout.fits:
             passed = self._zeros(self.count) + self._steps * self.period
-            goal_fit, velocity, places, frame, filled = goal_motion.fitted_goal(
+            goal_fit, velocity, places, frame, filled = goal_motion.update_goal_fit(
                 layout, frame, valid, camera, goal_fit, passed, self._fresh
             )
         if layout.response:
@@ -367,7 +367,7 @@ class Pilot:
         zero = np.zeros((self.count, 3))
         goal_w = np.asarray(goal_w).reshape(-1, 3)
         attached = np.ones((1, 1))
-        measured = self._measured(pos_w, quat_wb, zero, zero, payload_w, goal_w, attached)
+        measured = self._stack_measurements(pos_w, quat_wb, zero, zero, payload_w, goal_w, attached)
         pos, quat, _, _, payload, goal, _ = map(torch.as_tensor, measured)
         points, valid = keypoints_of(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()

@@ -211,11 +211,11 @@ class Policy:
         Returns:
             What differs by allowance: dotted key -> the value here, None where there is nothing.
         """
-        trained = flattened(self.contract, sections)
-        current = flattened(contract_now, sections)
+        trained = flatten(self.contract, sections)
+        current = flatten(contract_now, sections)
         keys = sorted(trained.keys() | current.keys())
         pairs = [(trained.get(key, _ABSENT), current.get(key, _ABSENT)) for key in keys]
-        differing = [key for key, pair in zip(keys, pairs) if not _same(*pair)]
+        differing = [key for key, pair in zip(keys, pairs) if not _is_same(*pair)]
         allowed = [
             key
             for key in differing
@@ -382,7 +382,7 @@ def _fields_of(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
         if name.startswith(ESTIMATOR)
     }
     if parts:
-        fields["estimator"] = Estimator.of_parts(parts)
+        fields["estimator"] = Estimator.from_parts(parts)
     return fields
 
 
@@ -418,7 +418,7 @@ def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     return {key: header[key] for key in schema}
 
 
-def flattened(tree: Mapping[str, Any], sections: Collection[str] | None = None) -> dict[str, Any]:
+def flatten(tree: Mapping[str, Any], sections: Collection[str] | None = None) -> dict[str, Any]:
     """Flatten nested dictionaries and lists to dotted keys; an empty one stays as a value."""
     flat: dict[str, Any] = {}
 
@@ -437,7 +437,7 @@ def flattened(tree: Mapping[str, Any], sections: Collection[str] | None = None) 
     return flat
 
 
-def _same(a: Any, b: Any) -> bool:
+def _is_same(a: Any, b: Any) -> bool:
     if isinstance(a, bool) or isinstance(b, bool):
         return a is b
     if isinstance(a, int | float) and isinstance(b, int | float):

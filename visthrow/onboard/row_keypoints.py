@@ -14,8 +14,8 @@ from camera.keypoints import (
     GOAL_KEYPOINTS,
     MAX_SINE,
     KeypointCamera,
+    apply_invalid_rule,
     box_midpoints,
-    by_rule,
 )
 
 Vector = tuple[float, float, float]
@@ -40,9 +40,9 @@ def row_keypoints(
     points = np.array([[(u, v) for u, v, _ in marks]])
     valid = np.array([[seen for _, _, seen in marks]])
     if not lens.circle_inside_image:
-        valid &= lens.on_sensor(lens.denormalize(points))
+        valid &= lens.is_on_sensor(lens.denormalize(points))
     points[:, GOAL_KEYPOINTS:] = box_midpoints(points[:, GOAL_KEYPOINTS:])
-    return by_rule(camera, points.astype(np.float32), valid)
+    return apply_invalid_rule(camera, points.astype(np.float32), valid)
 
 
 def _radius_and_slope(lens: Fisheye, theta: float) -> tuple[float, float]:

@@ -23,7 +23,7 @@ def _layer(weight: Tensor, bias: Tensor) -> Layer:
     return np.ascontiguousarray(weight.numpy().T), bias.numpy()
 
 
-def _applied(layer: Layer, row: ndarray) -> ndarray:
+def _apply(layer: Layer, row: ndarray) -> ndarray:
     weight, bias = layer
     return row @ weight + bias
 
@@ -68,8 +68,8 @@ class RowPolicy:
             mean, std = self._normalizer
             x = (x - mean) / std
         for layer in self._hidden:
-            x = self._activation(_applied(layer, x))
-        return _applied(self._last, x), memory
+            x = self._activation(_apply(layer, x))
+        return _apply(self._last, x), memory
 
 
 class RowEstimator:
@@ -93,13 +93,13 @@ class RowEstimator:
         width = self._width
         x = (obs - self._mean) / self._std
         for layer in self._encoder:
-            x = _elu(_applied(layer, x))
-        new = _applied(self._input, x)
-        old = _applied(self._recurrent, memory)
+            x = _elu(_apply(layer, x))
+        new = _apply(self._input, x)
+        old = _apply(self._recurrent, memory)
         gates = _sigmoid(new[:, : 2 * width] + old[:, : 2 * width])
         reset = gates[:, :width]
         update = gates[:, width:]
         candidate = np.tanh(new[:, 2 * width :] + reset * old[:, 2 * width :])
         memory = candidate + update * (memory - candidate)
         padded = np.append(obs, np.zeros((1, 1), obs.dtype), axis=1)
-        return padded[:, self._kept] + _applied(self._output, memory), memory
+        return padded[:, self._kept] + _apply(self._output, memory), memory

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.errors import StorageError
-from visthrow.view.parts import aligned
+from visthrow.view.parts import align
 
 FOLDER = Path(__file__).with_name("records") / "bench"
 PAGES = Path(__file__).with_name("records") / "pages"
@@ -23,7 +23,7 @@ One that another version measured has the command of today besides, ``today``.
 def body(record: dict[str, Any]) -> str:
     """Title, tables and notes of a record as Markdown."""
     tables = [
-        f"**{table['title']}**\n\n{aligned(table['header'], table['rows'])}"
+        f"**{table['title']}**\n\n{align(table['header'], table['rows'])}"
         for table in record["tables"]
     ]
     return "\n\n".join(
@@ -46,10 +46,10 @@ def origin(record: dict[str, Any]) -> str:
     if processors.get("gpu"):
         machine += f"; {', '.join(processors['gpu'])}"
     versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
-    return f"{made_by(record)}\n\n{machine}\n\n{versions}"
+    return f"{provenance_of(record)}\n\n{machine}\n\n{versions}"
 
 
-def made_by(record: dict[str, Any]) -> str:
+def provenance_of(record: dict[str, Any]) -> str:
     """Command, time and commit of a record, and the command that measures it today where that is
     another.
     """

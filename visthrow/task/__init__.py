@@ -381,7 +381,7 @@ class Experiment:
         if action.max_thrust == 0.0:
             action = replace(action, max_thrust=4.0 * self.vehicle.controller.max_thrust)
         roll, pitch, yaw = action.max_rate
-        followed = _followed_rates(self.vehicle)
+        followed = _largest_rates(self.vehicle)
         rates = (roll or followed[0], pitch or followed[1], yaw or followed[2])
         action = replace(action, max_rate=rates)
         object.__setattr__(self, "task", replace(self.task, action=action))
@@ -395,7 +395,7 @@ class Experiment:
             raise ConfigError(wrong)
 
 
-def _followed_rates(vehicle: VehicleParams) -> tuple[float, float, float]:
+def _largest_rates(vehicle: VehicleParams) -> tuple[float, float, float]:
     """Return the largest body rates that a vehicle is commanded [rad/s].
 
     They are at most those that a 3-inch quadrotor follows well. A rate error of the largest rate
@@ -539,7 +539,7 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     return contract
 
 
-def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
+def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or
     nothing is uncertain.
 
@@ -552,7 +552,7 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     import numpy as np
 
     from sim.effects.effect import apply, possible_together
-    from sim.effects.setting import Setting, generalised, specialised
+    from sim.effects.setting import Setting, generalise, specialise
     from visthrow.config.effects import chosen
 
     covariance = np.array(diagnosed.covariance)
@@ -563,7 +563,7 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
             " eigenvalue"
         )
     normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
-    base = generalised(Setting(plant, experiment.sensing))
+    base = generalise(Setting(plant, experiment.sensing))
     effects = {name: effect.bounded(base) for name, effect in chosen(diagnosed.effects).items()}
     plants = []
     for draw in normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T:
@@ -572,5 +572,5 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
             for name, x in zip(diagnosed.effects, draw)
         }
         theta = possible_together(effects, base, theta)
-        plants.append(specialised(apply(effects, base, theta).plant, plant))
+        plants.append(specialise(apply(effects, base, theta).plant, plant))
     return plants

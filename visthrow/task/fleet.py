@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import torch
 
 from sim.params import GRAVITY, PlantParams, changed
-from sim.scaling.units import PLANT, Units, dimensions_of, in_units
+from sim.scaling.units import PLANT, Units, convert_units, dimensions_of
 from sim.scaling.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
@@ -127,7 +127,7 @@ def members(experiment: Experiment) -> list[Member]:
     vehicles = []
     for plant in plants or [nominal]:
         units = fleet.units_of(plant)
-        vehicles.append(Member(changed(in_units(plant, units), task), units))
+        vehicles.append(Member(changed(convert_units(plant, units), task), units))
     return vehicles
 
 
@@ -137,13 +137,13 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     """
     chosen = members(experiment)[number]
     inverse_units = chosen.units.inverse
-    plant = in_units(chosen.plant, inverse_units)
+    plant = convert_units(chosen.plant, inverse_units)
     camera = experiment.camera
     size = chosen.units.length
     sensors = experiment.task.observation  # their delays do not follow size
     values = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
     values |= {
-        "task": in_units(experiment.task, inverse_units, TASK),
+        "task": convert_units(experiment.task, inverse_units, TASK),
         "camera.mount.position_b": tuple(size * x for x in camera.mount.position_b),
         "camera.payload_radius": plant.rope.payload_radius,
         "camera.goal_side": size * camera.goal_side,

@@ -50,7 +50,7 @@ def as_flown(experiment: Experiment) -> Experiment:
     return config.loads(Experiment, text, experiment.flown, name=name)
 
 
-def without_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:
+def blank_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:
     """Return columns, a row a throw, with NaN in the rows of failed throws."""
     blank = np.where(success, 1.0, np.nan)
     return {name: (blank * values.T).T for name, values in columns.items()}

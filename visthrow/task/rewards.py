@@ -59,7 +59,7 @@ def proximity(p: RewardParams, clearance: Tensor, margin: float) -> Tensor:
     return -p.proximity * missing
 
 
-def at_release(
+def release_reward(
     p: RewardParams, error: Tensor, time: Tensor, clearance: Tensor, margin: float
 ) -> Tensor:
     """r_land + r_tof + r_prox of a release, shape (E,); arguments as of :func:`landing`,

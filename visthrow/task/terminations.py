@@ -30,7 +30,7 @@ def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
     }
 
 
-def while_carrying(
+def ends_while_carrying(
     p: BoundsParams,
     pos_w: Array,
     upright: Array,
@@ -71,12 +71,12 @@ def negative(
     Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
 
     Args:
-        p, pos_w, payload_w, time, landing_height: as of :func:`while_carrying`. rot_wb: shape (E,
-            3, 3).
+        p, pos_w, payload_w, time, landing_height: as of :func:`ends_while_carrying`.
+        rot_wb: shape (E, 3, 3).
         status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """
     failed = (status & (COLLISION | NONFINITE)) != 0
     always = reduce(or_, out_of_bounds(p, pos_w).values()) | failed
-    carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)
+    carrying = ends_while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)
     early = reduce(or_, carrying.values()) & ~latched
     return always | early

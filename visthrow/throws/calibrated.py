@@ -19,7 +19,7 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.workers import done
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.onboard.calibration import HOVER, SWAY, Calibration, Hovered, solved, sway
+from visthrow.onboard.calibration import HOVER, SWAY, Calibration, Hovered, sway, try_calibration
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 
@@ -33,7 +33,7 @@ SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
 TOO_FEW = 8
 
 
-def calibrated_start(
+def start_calibrated(
     experiment: Experiment, records: list[Calibration | None] | None = None
 ) -> "Callable[[ThrowEnv], TensorDict]":
     """Return the start of :func:`visthrow.training.protocol.throw`; ConfigError for another layout
@@ -49,7 +49,7 @@ def calibrated_start(
         )
 
     def begin(env: "ThrowEnv") -> "TensorDict":
-        estimates = _calibrations(experiment, _hovered(env))
+        estimates = _calibrations(experiment, _hover(env))
         if records is not None:
             records[:] = estimates
         turns = [c.turn_b if c else (0.0, 0.0, 0.0) for c in estimates]
@@ -60,7 +60,7 @@ def calibrated_start(
     return begin
 
 
-def _hovered(env: "ThrowEnv") -> list[Hovered]:
+def _hover(env: "ThrowEnv") -> list[Hovered]:
     """Hover, sway and settle; what was measured till the end of the sway, of each vehicle."""
     cfg = env.cfg
     period = env.cfg.sim.control_period
@@ -73,7 +73,7 @@ def _hovered(env: "ThrowEnv") -> list[Hovered]:
     rows = []
     mass = plant_of(cfg).total_mass
     for k in range(last):
-        measured = _measured(env)
+        measured = _measure(env)
         command = controller.step(*measured[:3], home, mass)
         since = k * period - HOVER
         if 0.0 <= since < SWAY:
@@ -91,7 +91,7 @@ def _hovered(env: "ThrowEnv") -> list[Hovered]:
     return [Hovered(*(column[i] for column in columns)) for i in range(env.num_envs)]
 
 
-def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
+def _measure(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
     """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of
     this step.
     """
@@ -105,7 +105,7 @@ def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
 
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     """Return the calibration of each hover; None where it shows too little."""
-    solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
+    solve = partial(try_calibration, camera=experiment.camera, contract=contract_of(experiment))
     processes = cores() if len(hovered) > TOO_FEW else 1
     estimates = dict(done(solve, hovered, processes, "calibrations"))
     ordered = [estimates[place] for place in range(len(hovered))]

@@ -16,7 +16,7 @@ from numpy import ndarray
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.onboard.pilot import Pilot
 from visthrow.task import Experiment, terminations
-from visthrow.task.measurement import without_failed
+from visthrow.task.measurement import blank_failed
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
 
@@ -283,7 +283,7 @@ class Flight:
         """Measure, decide, send."""
         plant = self.plant
         measurement = plant.measured()
-        hold_command = self._latched_now(measurement)
+        hold_command = self._command_hover(measurement)
         self.flown = self.open & measurement.attached & throws
         sent = Decision(hold_command, np.zeros(plant.count, bool))
         if math.isnan(self.begin):
@@ -301,7 +301,7 @@ class Flight:
             self.judge(self.now)
         self.recorder.after(self, measurement, sent)
 
-    def _latched_now(self, snapshot: Snapshot) -> ndarray:
+    def _command_hover(self, snapshot: Snapshot) -> ndarray:
         """Commands of the hover controller."""
         plant = self.plant.params
         mass = plant.vehicle.body.mass + np.where(snapshot.attached, plant.rope.hanging_mass, 0.0)
@@ -332,7 +332,7 @@ class Flight:
         touching = rope.payload_radius + experiment.vehicle.collision_radius
         upright = 1.0 - 2.0 * (snapshot.quat_wb[:, 0] ** 2 + snapshot.quat_wb[:, 1] ** 2)
         height = experiment.release.landing_height
-        carrying = terminations.while_carrying(
+        carrying = terminations.ends_while_carrying(
             bounds, pos_w, upright, payload_w, self.plant.time - self.begin, height
         )
         return {
@@ -402,4 +402,4 @@ class Scores(FlightObserver):
         }
         if np.any(flight.pilots.goal_vel_w):
             columns["goal_w"] = goal
-        return {"success": success} | without_failed(success, columns)
+        return {"success": success} | blank_failed(success, columns)

@@ -10,7 +10,7 @@ from sim.params import AirParams, changed
 from visthrow import config
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
-from visthrow.onboard.policy import Policy, find_policy, flattened
+from visthrow.onboard.policy import Policy, find_policy, flatten
 from visthrow.task import Experiment, contract_of, load_experiment
 from visthrow.task.fleet import specialised
 
@@ -50,19 +50,19 @@ def load_policy(
             :meth:`visthrow.onboard.policy.Policy.require`.
     """
     path = find_policy(name)
-    policy = _with_air_and_laws(Policy.load(path))
+    policy = _add_air_and_laws(Policy.load(path))
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
         # of the program, not of the camera
         trained = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
         experiment = load_experiment(config_name, [*trained, *overrides])
     else:
-        experiment = trained_in(policy, path, overrides)
+        experiment = training_experiment(policy, path, overrides)
     contract_here = contract_of(experiment)
     for part in allow:
         _check_part(part, (policy.contract, contract_here, contract_of(experiment, whole=True)))
     try:
-        widened = _allowed_sections(policy, experiment)
+        widened = _list_allowed(policy, experiment)
         departures = policy.require(contract_here, allow=(*allow, *widened))
         departures = {
             key: value for key, value in departures.items() if key.split("[")[0] not in widened
@@ -83,7 +83,7 @@ def load_policy(
     )
 
 
-def _with_air_and_laws(policy: Policy) -> Policy:
+def _add_air_and_laws(policy: Policy) -> Policy:
     """Return a policy whose contract holds the air and the laws of its training: in older files
     only the config states them.
     """
@@ -99,7 +99,7 @@ def _with_air_and_laws(policy: Policy) -> Policy:
 
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
     """Raise ConfigError where a part that may be broken is in no contract."""
-    keys = {key for contract in contracts for key in flattened(contract)}
+    keys = {key for contract in contracts for key in flatten(contract)}
     groups = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
     if part not in groups:
         sections = sorted(name for name in groups if "." not in name)
@@ -109,7 +109,7 @@ def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
         )
 
 
-def trained_in(
+def training_experiment(
     policy: Policy,
     path: str | Path,
     overrides: Iterable[str] = (),
@@ -129,7 +129,7 @@ def trained_in(
     # newer one.
     layout = policy.contract.get("observation", {}).get("layout", "state")
     learning = config.to_dict(load_experiment(layout).ppo)
-    text = toml_text.dumps(config.without_none({**trained, "ppo": learning}))
+    text = toml_text.dumps(config.spell_none({**trained, "ppo": learning}))
     return config.loads(
         kind,
         text,
@@ -138,7 +138,7 @@ def trained_in(
     )
 
 
-def _allowed_sections(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
+def _list_allowed(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
     """Keys of the contract that differ, but no further than the training went: latencies inside its
     range.
     """

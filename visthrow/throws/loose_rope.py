@@ -54,7 +54,7 @@ class LooseRope:
         count = max(1, round(duration / STEP))
         h = duration / count
         for _ in range(count):
-            moved = self._with_links(self.offset_w + h * self.velocity_w)
+            moved = self._restore_links(self.offset_w + h * self.velocity_w)
             self.velocity_w = (moved - self.offset_w) / h
             self.offset_w = moved
 
@@ -72,11 +72,11 @@ class LooseRope:
             moved = self.offset_w + h * np.exp(-SINKING_DAMPING * h) * self.velocity_w
             end = np.zeros(3)
             for i in range(len(moved) - 1, -1, -1):
-                end = moved[i] = _on_link(moved[i], end, self._lengths[i], ground)
+                end = moved[i] = _place_on_link(moved[i], end, self._lengths[i], ground)
             self.velocity_w = (moved - self.offset_w) / h
             self.offset_w = moved
 
-    def _with_links(self, moved: ndarray) -> ndarray:
+    def _restore_links(self, moved: ndarray) -> ndarray:
         """Put positions back onto the links, along the links' directions before the step."""
         before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
         weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not give way
@@ -99,7 +99,7 @@ class LooseRope:
         return np.vstack((self.offset_w, knot)) + ball_w
 
 
-def _on_link(joint: ndarray, end: ndarray, length: float, ground: float) -> ndarray:
+def _place_on_link(joint: ndarray, end: ndarray, length: float, ground: float) -> ndarray:
     """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's
     centre [m].
     """

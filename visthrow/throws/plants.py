@@ -37,7 +37,7 @@ PLANTS = {
 """Name -> what pictures call it, and what titles of tables call it."""
 
 
-def known_plant(name: str) -> str:
+def check_plant(name: str) -> str:
     """Return a name of :data:`PLANTS`; ConfigError for another."""
     if name not in PLANTS:
         raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
@@ -166,7 +166,7 @@ class HybridPlant:
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
         if np.any(self._age):
             self._past = [self.state, *self._past[:-1]]
-        self._sim.set_command(command if self._start is None else self._disturbed(command), release)
+        self._sim.set_command(command if self._start is None else self._disturb(command), release)
         self._sim.step()
         self._state = None
         self._latched = self._latched | release
@@ -217,7 +217,7 @@ class HybridPlant:
         later = np.where(waits, timer + time, timer).astype(timer.dtype)
         self._sim.state.release_timer.assign(later)
 
-    def _disturbed(self, command: ndarray) -> ndarray:
+    def _disturb(self, command: ndarray) -> ndarray:
         """Commands with the training's noise, which is on their normalised form."""
         import torch
 
@@ -404,7 +404,7 @@ def make_plant(
     """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and
     latency.
     """
-    if known_plant(name) == "hybrid":
+    if check_plant(name) == "hybrid":
         task = experiment.task
         return HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency)
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")

@@ -160,7 +160,7 @@ def fly(
         return _speed(snapshot.vel_w) < QUIET_SPEED and bool(at_rest)
 
     flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
-    return _finished(flight, recording, recovery)
+    return _finish(flight, recording, recovery)
 
 
 def check_goal(loaded: Loaded, goal_w: ndarray) -> None:
@@ -208,7 +208,7 @@ def _hovering(
     return Phase(False, finished)
 
 
-def _finished(flight: Flight, recording: ThrowRecorder, recovery: float) -> FlightLog:
+def _finish(flight: Flight, recording: ThrowRecorder, recovery: float) -> FlightLog:
     """Return the log with the last state, and how the throw ended."""
     plant = flight.plant
     state = flight.now

@@ -206,10 +206,10 @@ def join(results: Iterable[Result]) -> list[Result]:
         group = groups.setdefault(key_of(common), {})
         if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
             group[batch] = result
-    return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
+    return whole + [_join([group[batch] for batch in sorted(group)]) for group in groups.values()]
 
 
-def _joined(group: list[Result]) -> Result:
+def _join(group: list[Result]) -> Result:
     if len(group) == 1:
         return group[0]
     unit = dict(group[0].unit)

@@ -40,7 +40,7 @@ class HybridWirePlant:
 
     def __init__(self, experiment: Experiment, seed: int) -> None:
         """Put the vehicle near its hover point, the rope swinging a little."""
-        self._plant = self._built(experiment)
+        self._plant = self._build(experiment)
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
         self.max_thrust = experiment.task.action.max_thrust
@@ -48,7 +48,7 @@ class HybridWirePlant:
         place = self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3))
         self._plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, 0.05))
 
-    def _built(self, experiment: Experiment) -> HybridPlant:
+    def _build(self, experiment: Experiment) -> HybridPlant:
         return HybridPlant(self._fine(experiment))
 
     def _fine(self, experiment: Experiment) -> Experiment:

@@ -25,7 +25,7 @@ from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import DistillationParams, Experiment, contract_of
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.algorithm import Algorithm
-from visthrow.training.ppo.network import MuonAdam, averaged, cosine_rate, normalizer_state
+from visthrow.training.ppo.network import MuonAdam, average_weights, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 1.0, 0.01, 0.005, 1.0)
@@ -123,7 +123,7 @@ class Distillation(Algorithm):
         T = p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
-        passed, learnt = _passed(env.layout, layout)
+        passed, learnt = _map_entries(env.layout, layout)
         self.network = EstimatorNetwork(passed, learnt, env.layout.dimension, p).to(device)
         ranks.share(self.network)
         widths = [3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + layout.history), 1]
@@ -133,7 +133,7 @@ class Distillation(Algorithm):
         self._alive = torch.zeros(T, E, device=device)
         self._history = torch.zeros(E, 1 + layout.history, layout.payload, device=device)
         self._flying = self.network.frozen()
-        self.average = averaged(self.network, AVERAGED)
+        self.average = average_weights(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
         weights = self.network.parameters()
         matrices = self.network.matrices
@@ -220,7 +220,7 @@ class Distillation(Algorithm):
     def export(self, contract: dict, made_by: dict) -> Policy:
         t = self.teacher.to("cpu")
         parts = self.average.module.frozen().parts()
-        estimator = Estimator.of_parts({name: part.cpu().clone() for name, part in parts.items()})
+        estimator = Estimator.from_parts({name: part.cpu().clone() for name, part in parts.items()})
         return Policy(
             t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator
         )
@@ -241,7 +241,7 @@ class Distillation(Algorithm):
         self.average.module.load_state_dict(n.state_dict())
 
 
-def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
+def _map_entries(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
     """Which entry of a vision observation each entry of a state observation corrects, and which of
     these are learnt.
     """

@@ -64,7 +64,7 @@ def run(args: Options) -> int:
     _check(args)
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
-    begun = _resumed if args.resume else _begun
+    begun = _resume if args.resume else _begin
     experiment, policy, seed = begun(args, path, folder)
     name = compute_device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
@@ -125,7 +125,7 @@ def _check(args: Options) -> None:
         raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
 
 
-def _begun(args: Options, path: Path, folder: Path) -> tuple:
+def _begin(args: Options, path: Path, folder: Path) -> tuple:
     """Experiment, policy to start from or None, and seed of a new run; StorageError where the
     folder holds one already.
     """
@@ -138,7 +138,7 @@ def _begun(args: Options, path: Path, folder: Path) -> tuple:
     return fitted(experiment, policy), policy, seed
 
 
-def _resumed(args: Options, path: Path | None, folder: Path) -> tuple:
+def _resume(args: Options, path: Path | None, folder: Path) -> tuple:
     """Experiment, None and seed of the run in the folder; CheckpointError where there is none, or
     what is named contradicts it.
     """

@@ -18,7 +18,7 @@ from camera.calibrate.boards import (
     calibrate_from_boards,
     check_boards,
     find_board,
-    reprojected,
+    reproject,
 )
 from camera.calibrate.files import read, read_mount
 from camera.calibrate.foreign import HOLDS_PX
@@ -100,7 +100,7 @@ def calibrate(args: argparse.Namespace) -> int:
             f"calibrated on {len(images)} pictures of a {board.pattern}, reprojection error"
             f" {report.rms_px:.3f} px rms"
         )
-        print("\n".join(_by_picture(paths, report)))
+        print("\n".join(_list_by_picture(paths, report)))
     else:
         if len(args.source) != 1:
             raise ConfigError(
@@ -141,7 +141,7 @@ def check(args: argparse.Namespace) -> int:
     paths, images = pictures_of(args.pictures)
     residuals = check_boards(images, board, camera.fisheye)
     _, best = calibrate_from_boards(images, board, camera.fisheye.fov_deg)
-    print("\n".join(_by_picture(paths, residuals)))
+    print("\n".join(_list_by_picture(paths, residuals)))
     fits, why = verdict(camera, residuals, best)
     print(
         f"reprojection error {residuals.rms_px:.3f} px rms; of the lens that fits these pictures"
@@ -184,7 +184,7 @@ def verdict(camera: CameraParams, report: BoardReport, best: BoardReport) -> tup
     )
 
 
-def _by_picture(paths: list[Path], report: BoardReport) -> Iterator[str]:
+def _list_by_picture(paths: list[Path], report: BoardReport) -> Iterator[str]:
     for i, (path, rms) in enumerate(zip(paths, report.image_rms_px, strict=True)):
         missing = f"left out: {report.left_out[i]}" if i in report.left_out else "no board found"
         yield f"{path.name:24s} " + (missing if math.isnan(rms) else f"{rms:.3f} px")
@@ -218,7 +218,7 @@ def show(args: argparse.Namespace) -> int:
     if args.picture:
         image = pictures_of([args.picture])[1][0]
     else:
-        image = _rendered(params, pos_w, rot_wb, ball_w, goal_w)
+        image = _render(params, pos_w, rot_wb, ball_w, goal_w)
     points, valid = keypoints(camera, pos_w[None], rot_wb[None], goal_w[None], ball_w[None])
     image_out = draw_overlay(camera, points[0], valid[0], image)
     if args.board:
@@ -240,7 +240,7 @@ def show(args: argparse.Namespace) -> int:
     return 0
 
 
-def _rendered(params: CameraParams, *places: torch.Tensor) -> ndarray:
+def _render(params: CameraParams, *places: torch.Tensor) -> ndarray:
     """Render a grey hall with vehicle, ball and goal square; BGR, uint8, shape (H, W, 3)."""
     eyes = load_extra("visthrow.detector_training.eyes", "detector", "a picture", ConfigError)
     return eyes.render_hall(params, *places, samples=SAMPLES)
@@ -254,7 +254,7 @@ def _draw_board(canvas: ndarray, image: ndarray, lens: Fisheye, args: argparse.N
             f"{args.picture or 'the rendered scene'}: no {board.pattern} of {board.columns} x"
             f" {board.rows} points in it"
         )
-    expected = reprojected(lens, view)
+    expected = reproject(lens, view)
     for pixels, colour, size in ((view.pixels, YELLOW, 5), (expected, BLUE, 2)):
         for u, v in pixels:
             cv2.circle(canvas, (round(u), round(v)), size, colour, 1, cv2.LINE_AA)

@@ -84,7 +84,7 @@ def _axes(
     return figure, axes
 
 
-def _labelled(axes: Any, below: str | None, ylabel: str, **look: Any) -> None:
+def _label_axes(axes: Any, below: str | None, ylabel: str, **look: Any) -> None:
     """Name the outer axes of a grid."""
     for axis in axes[-1] if below else ():
         axis.set_xlabel(below, **look)
@@ -167,7 +167,7 @@ def scatter(
             _landings(axis, points, half, i, label)
         axis.set(xlim=(-half, half), ylim=(-half, half), aspect="equal")
         axis.set_title(title, fontsize=10.5 if columns <= 3 else 8.5)
-    _labelled(axes, "lateral, to the right [m]", "along the throw [m]")
+    _label_axes(axes, "lateral, to the right [m]", "along the throw [m]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     if len(labels) > 1:
         figure.legend(
@@ -280,7 +280,7 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
             _log_axis(axis, "y")
         else:
             axis.set_ylim(bottom=0.0)
-    _labelled(axes, None, ylabel)
+    _label_axes(axes, None, ylabel)
     if len(labels) > 1:
         limit = 4 if columns > 1 else 2
         how = {"loc": "outside upper center", "ncols": min(len(labels), limit)}
@@ -312,5 +312,5 @@ def learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
         axis.set_title(title, fontsize=7.5)
         axis.tick_params(labelsize=7.5)
         axis.grid(True, which="major")
-    _labelled(axes, "million steps", "error [m]", fontsize=8)
+    _label_axes(axes, "million steps", "error [m]", fontsize=8)
     return png_of(figure)

@@ -83,16 +83,16 @@ def _messages(log: FlightLog, experiment: Any) -> Iterator[Message]:
             moved = {
                 "parent_frame_id": "world",
                 "child_frame_id": "vehicle",
-                "translation": _named("xyz", place),
-                "rotation": _named("xyzw", turn),
+                "translation": _name("xyz", place),
+                "rotation": _name("xyzw", turn),
             }
             yield time, "/tf", "foxglove.FrameTransform", moved
-            yield _placed(time, "/vehicle", _pose(place, turn))
+            yield _place(time, "/vehicle", _pose(place, turn))
     for name, topic in (("payload_pos_w", "/payload"), ("goal_w", "/goal")):
         for time, place in _rows(log, name):
-            yield _placed(time, topic, _pose(place))
+            yield _place(time, topic, _pose(place))
     for time, row in _rows(log, "command"):
-        command = _named(("thrust_n", "rate_x", "rate_y", "rate_z"), row)
+        command = _name(("thrust_n", "rate_x", "rate_y", "rate_z"), row)
         yield time, "/command", "visthrow.Command", command
     yield from _scene(log, experiment)
     yield from _pictures(log, experiment)
@@ -111,7 +111,7 @@ def _messages(log: FlightLog, experiment: Any) -> Iterator[Message]:
         yield time, "/events", "foxglove.Log", message
 
 
-def _placed(time: float, topic: str, pose: dict[str, Any]) -> Message:
+def _place(time: float, topic: str, pose: dict[str, Any]) -> Message:
     content = {"frame_id": "world", "pose": pose}
     return time, topic, "foxglove.PoseInFrame", content
 
@@ -124,7 +124,7 @@ def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
         return time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entity]}
 
     for time, row in _rows(log, "cable_points_w"):
-        points = [_named("xyz", point) for point in row]
+        points = [_name("xyz", point) for point in row]
         line = {"pose": _pose((0.0, 0.0, 0.0)), "points": points}
         yield thing(time, "rope", "lines", line | SCENE["rope"])
     width = 2.0 * experiment.rope.payload_radius
@@ -135,7 +135,7 @@ def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
     )
     for channel, name, kind, size in solids:
         for time, row in _rows(log, channel):
-            solid = {"pose": _pose(row), "size": _named("xyz", size)}
+            solid = {"pose": _pose(row), "size": _name("xyz", size)}
             yield thing(time, name, kind, solid | SCENE[name])
 
 
@@ -170,9 +170,9 @@ def _rows(log: FlightLog, name: str) -> Iterator[tuple[float, np.ndarray]]:
         yield from zip(channel.time[rows].tolist(), channel.values[rows], strict=True)
 
 
-def _named(names: Iterable[str], values: Any) -> dict[str, float]:
+def _name(names: Iterable[str], values: Any) -> dict[str, float]:
     return dict(zip(names, map(float, values), strict=True))
 
 
 def _pose(place: Any, turn: Any = (0.0, 0.0, 0.0, 1.0)) -> dict[str, Any]:
-    return {"position": _named("xyz", place), "orientation": _named("xyzw", turn)}
+    return {"position": _name("xyz", place), "orientation": _name("xyzw", turn)}

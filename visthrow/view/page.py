@@ -9,7 +9,7 @@ from pathlib import Path
 from visthrow import __version__
 from visthrow.common.storage import atomic_write
 from visthrow.view.parts import Grid, Picture, Section, Text
-from visthrow.view.templates import rendered
+from visthrow.view.templates import render
 
 PAGE = "report.html"
 """In the folder of a report."""
@@ -21,7 +21,7 @@ LEADS = {"missing": "*Missing.* ", "finding": "- "}
 _CODE = re.compile(r"`(.+?)`")
 
 
-def _marked(text: str) -> str:
+def _mark_up(text: str) -> str:
     """HTML of a paragraph with its bold words and code."""
     return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
 
@@ -30,9 +30,9 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the whole page; it loads nothing from elsewhere."""
     import markupsafe
 
-    return rendered(
+    return render(
         Path(__file__).with_name("data") / "page.html.j2",
-        {"marked": lambda text: markupsafe.Markup(_marked(text)), "inline": _inline},
+        {"marked": lambda text: markupsafe.Markup(_mark_up(text)), "inline": _inline},
         escape=True,
         title=title,
         lead=lead,

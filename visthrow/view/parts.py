@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 DPI = 150.0  # of pictures
 
 
-def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
+def align(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
     """Return a table as Markdown, columns aligned: the first ``heads`` columns stand left, all of
     them without it, the others right.
     """
@@ -71,7 +71,7 @@ class Grid:
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""
-        return f"**{self.title}**\n\n{aligned(self.header, self.rows, self.heads)}" + (
+        return f"**{self.title}**\n\n{align(self.header, self.rows, self.heads)}" + (
             f"\n\n{self.note}" if self.note else ""
         )
 

@@ -37,10 +37,10 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     Raises StorageError: the place cannot be written.
     """
     with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
-        whole(stream, log, experiment)
+        send_whole(stream, log, experiment)
 
 
-def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
+def send_whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
     """Send all of a flight; arguments as of :func:`write`."""
     still(stream, log.meta["goal_w"], experiment)
     send(stream, log)

@@ -61,7 +61,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     upper = PANEL * (side[2] + GROUND) / (side[1] - side[0])  # heights from here on in inches
     height = 1.18 + upper + 0.98 + PANEL + 0.08
     figure = plt.figure(figsize=(WIDTH, height))
-    lens = KeypointCamera(drawn_larger(camera))
+    lens = KeypointCamera(shrink_lens(camera))
     all_visible = True
     for column, (caption, time) in enumerate(views):
         x = LEFT_MARGIN + column * (PANEL + GAP)
@@ -101,7 +101,7 @@ def _headline(log: FlightLog) -> str:
     )
 
 
-def drawn_larger(camera: CameraParams) -> CameraParams:
+def shrink_lens(camera: CameraParams) -> CameraParams:
     """Return the lens on fewer pixels, on which the overlay's strokes are thicker."""
     lens = camera.fisheye
     scale = PIXELS / max(lens.width, lens.height)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from visthrow.common.toml_text import tables_beside
-from visthrow.view.parts import aligned
+from visthrow.view.parts import align
 
 _TABLES = tables_beside(__file__, "data/paper.toml")
 
@@ -51,7 +51,7 @@ def markdown(rows: Sequence[dict], title: str) -> str:
     """Table of summaries, :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and
     ``layout`` added.
     """
-    return f"{title}\n\n{aligned(HEADER.split(' | '), [_cells(row) for row in rows], heads=1)}\n"
+    return f"{title}\n\n{align(HEADER.split(' | '), [_cells(row) for row in rows], heads=1)}\n"
 
 
 def _cells(row: dict) -> tuple[str, ...]:

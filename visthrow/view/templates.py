@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 
-def rendered(
+def render(
     path: Path,
     filters: Mapping[str, Callable[..., Any]],
     *,

@@ -177,7 +177,7 @@ class Commander:
                 record.ready, record.release = RELEASE, parts.agreed is None
             else:
                 record.note = f"release refused: {problem}"
-                parts.pilot.not_released()
+                parts.pilot.cancel_release()
         if parts.agreed == RELEASE and parts.latch.at is None:
             record.release = True
         return tuple(map(float, output.command[0]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from hil.control.tick.body_estimate import Estimate
 from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
-from visthrow.common.rotations import plus, rotate_one, turned_one
+from visthrow.common.rotations import plus, rotate_one, turn_one
 from visthrow.onboard.hover import GRAVITY
 
 RESPONSE = 0.05  # time constant with which body rates follow their command [s]
@@ -56,7 +56,7 @@ def _advanced(
     if rates is None:
         share = 1.0 - math.exp(-step / RESPONSE)
         rates = tuple(rate + share * (new - rate) for rate, new in zip(state.rate, commanded))
-    quat = turned_one(state.quat, rates, step)
+    quat = turn_one(state.quat, rates, step)
     force_w = rotate_one(quat, (0.0, 0.0, thrust / mass))
     acceleration_w = (force_w[0], force_w[1], force_w[2] - GRAVITY)
     vel = plus(state.vel, acceleration_w, step)

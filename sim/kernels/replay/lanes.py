@@ -203,7 +203,7 @@ class Replay:
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
         launches = [
             rows[np.argsort(-costs[rows], kind="stable")]
-            for rows in _in_order(np.asarray(lanes["shared"]), resumed)
+            for rows in _lane_order(np.asarray(lanes["shared"]), resumed)
         ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         begin = _struct(k.State, starts, device)
@@ -277,7 +277,7 @@ def _shared_out(costs: ndarray, pieces: int) -> list[int]:
     return np.unique([0, *cuts.tolist(), len(costs)]).tolist()
 
 
-def _in_order(shared: ndarray, resumed: ndarray) -> tuple[ndarray, ndarray]:
+def _lane_order(shared: ndarray, resumed: ndarray) -> tuple[ndarray, ndarray]:
     """Lanes that fly, those from a start and those that leave another lane on its way; the rest
     ride along.
     """

@@ -17,8 +17,8 @@ from camera.detectors.contours import (
     Detector,
     FrameDetections,
     Prior,
-    detected_keypoints,
-    ordered_corners,
+    convert_to_training_keypoints,
+    order_corners,
 )
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
@@ -26,7 +26,7 @@ from camera.params import FisheyeParams
 from tests.lenses import camera_of, f64
 from visthrow.detector_training.eyes import render_hall
 from visthrow.detector_training.scenes.renderer import Renderer
-from visthrow.detector_training.scenes.scene import posed_scenes
+from visthrow.detector_training.scenes.scene import make_plain_scenes
 
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)
@@ -60,7 +60,7 @@ def scene():
 def cluttered():
     """Neither goal nor payload in view, only what resembles them: a blue ball, two mats."""
     ball, goal = f64([[0.0, -0.7, 0.1]]), f64([[60.0, 0.0]])
-    scenes = posed_scenes(CAMERA.params, POS, ROT, ball, goal, torch.tensor([False]))
+    scenes = make_plain_scenes(CAMERA.params, POS, ROT, ball, goal, torch.tensor([False]))
     scenes.things[:, : len(MATS)] = MATS
     scenes.ball[:, 11:14] = BLUE
     image = Renderer(LENS, files=[], samples=4).render(scenes)[0].numpy()
@@ -76,7 +76,7 @@ def off(seen: FrameDetections) -> np.ndarray:
     """How far the keypoints are from the true ones [px], shape (8,)."""
     true, valid = keypoints(CAMERA, POS, ROT, GOAL, BALL)
     assert valid.all()
-    found, ok = detected_keypoints(CAMERA, seen, ROT[0].numpy())
+    found, ok = convert_to_training_keypoints(CAMERA, seen, ROT[0].numpy())
     assert ok.all()
     pixels = [CAMERA.fisheye.denormalize(points.double()).numpy() for points in (found, true[0])]
     return norm(pixels[0] - pixels[1], axis=1)
@@ -183,4 +183,4 @@ def test_corners_are_named_by_the_world(yaw):
     corners_w = goal_square(0.25).numpy() + [0.5, -0.8, -1.3]
     rays = corners_w / norm(corners_w, axis=1, keepdims=True) @ rot_wc
     for order in ([2, 3, 0, 1], [1, 0, 3, 2]):
-        assert_allclose(ordered_corners(rays[order], rot_wc), rays, atol=1e-12)
+        assert_allclose(order_corners(rays[order], rot_wc), rays, atol=1e-12)

@@ -146,7 +146,7 @@ def test_points_beside_the_sensor_are_not_valid_keypoints():
     points = f64([[0.0, math.sin(t), math.cos(t)], [math.sin(t), 0.0, math.cos(t)]])
     pixels, valid = lens.project(points)
     assert valid.all()
-    assert lens.on_sensor(pixels).tolist() == [False, True]
+    assert lens.is_on_sensor(pixels).tolist() == [False, True]
     assert lens.project_normalized(points)[1].tolist() == [False, True]
 
 

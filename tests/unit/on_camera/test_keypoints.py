@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from camera.fisheye import Fisheye
 from camera.keypoints import (
     KeypointCamera,
+    apply_invalid_rule,
     ball_extremes_c,
-    by_rule,
     keypoints,
     payload_keypoints,
 )
@@ -173,7 +173,7 @@ def test_out_of_view_tells_nothing_but_that():
     _, sides = payload_keypoints(camera, 0.2 * rays)
     partly = sides.any(-1) & ~sides.all(-1)
     assert partly.sum() > 3
-    shown, told = by_rule(
+    shown, told = apply_invalid_rule(
         camera, torch.ones(81, 8, 2, dtype=torch.float64), torch.cat([sides, sides], -1)
     )
     cut = told[partly, 4:]

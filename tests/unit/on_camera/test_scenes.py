@@ -13,7 +13,7 @@ from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
 from tests.lenses import camera_of
 from visthrow.detector_training.scenes.renderer import Renderer
-from visthrow.detector_training.scenes.scene import posed_scenes, random_scenes, truth_of
+from visthrow.detector_training.scenes.scene import make_plain_scenes, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 importorskip("skimage", reason="photographs of visthrow[detector]")
@@ -33,7 +33,7 @@ def renderer():
 
 def hovering(ball=(0.05, 0.1, 1.0)):
     """A plain scene, evenly lit, its ball without a seam."""
-    scenes = posed_scenes(
+    scenes = make_plain_scenes(
         CAMERA,
         torch.tensor([[0.0, 0.0, 1.3]]),
         rotation_from_vector(torch.tensor([[0.1, -0.2, 0.05]])),

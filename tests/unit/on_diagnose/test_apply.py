@@ -19,7 +19,7 @@ from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.task import DiagnosedParams, Experiment, drawn_plants, plant_of
+from visthrow.task import DiagnosedParams, Experiment, draw_plants, plant_of
 
 THETA = {
     "thrust_gain": 0.03,
@@ -84,7 +84,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     )  # no tilted frame
     assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
     lags = [
-        plant.release.lag for plant in drawn_plants(after, 0)
+        plant.release.lag for plant in draw_plants(after, 0)
     ]  # what varies from throw to throw does so in training
     assert np.std(lags) == approx(0.01, rel=0.5)
     assert len(set(lags)) == 8
@@ -176,7 +176,7 @@ def test_a_formula_without_a_coefficient_is_no_law_to_write(diagnosis, tmp_path,
 
 def test_every_effect_can_be_written():
     before = shipped()
-    setting = patch.generalised(patch.Setting(plant_of(before), camera=before.camera))
+    setting = patch.generalise(patch.Setting(plant_of(before), camera=before.camera))
     for name, e in catalogue().items():
         if name != "step_error" and e.applies(setting):  # whose step is the replay's
             theta = {name: 1.0 if e.switch else e.floor}
@@ -191,13 +191,13 @@ def test_draws_keep_what_is_pinned_together():
     loose = DiagnosedParams(
         ("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400
     )
-    plants = drawn_plants(replace(before, diagnosed=loose), 1)
+    plants = draw_plants(replace(before, diagnosed=loose), 1)
     gain = np.array([p.vehicle.thrust.gain[0] for p in plants]) - 1.0
     mass = np.array([p.vehicle.body.mass for p in plants]) - before.vehicle.body.mass
     assert np.std(gain) == approx(0.01, rel=0.15)
     assert np.corrcoef(gain, mass)[0, 1] > 0.97
-    assert drawn_plants(before, 1) == [plant_of(before)]
-    assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
+    assert draw_plants(before, 1) == [plant_of(before)]
+    assert draw_plants(replace(before, diagnosed=loose), 1) == plants
 
 
 def test_draws_that_share_a_number_keep_to_its_bounds_together():
@@ -206,7 +206,7 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
     loose = DiagnosedParams(
         ("rotor_drag_z", "rotor_drag"), ((spread**2, 0.0), (0.0, 4.0 * spread**2)), 50
     )
-    plants = drawn_plants(replace(before, diagnosed=loose), 1)
+    plants = draw_plants(replace(before, diagnosed=loose), 1)
     drags = [plant.vehicle.aero.drag_z for plant in plants]
     assert min(drags) == approx(0.0, abs=1e-15)
     assert max(drags) > spread
@@ -322,7 +322,7 @@ def test_a_broken_covariance_is_refused():
         DiagnosedParams(("rope_length",), ((1.0, 2.0),), 2)
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
     with raises(ConfigError, match="no covariance"):
-        drawn_plants(replace(shipped(), diagnosed=bad), 0)
+        draw_plants(replace(shipped(), diagnosed=bad), 0)
 
 
 def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):

@@ -12,7 +12,7 @@ from tests.commands import run_command
 from visthrow import cli
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog
-from visthrow.task import drawn_plants, load_experiment
+from visthrow.task import draw_plants, load_experiment
 
 MODEL = ("--only", "com_x", "--set", "rope.segments=1", "--device", "cpu", "--no-report")
 
@@ -68,7 +68,7 @@ def test_what_was_explained_is_what_training_draws(once, tmp_path):
     assert diagnosed.effects == ("com_x",)
     (sd,) = np.sqrt(diagnosed.covariance[0])
     assert 2e-5 < sd < 4e-4, "of 3 mm that three throws show to a few hundredths"
-    centres = [plant.vehicle.body.com[0] for plant in drawn_plants(load_experiment(out), 0)]
+    centres = [plant.vehicle.body.com[0] for plant in draw_plants(load_experiment(out), 0)]
     assert np.mean(centres) == approx(3e-3, abs=3.0 * sd)
     assert np.std(centres) == approx(sd, rel=0.5)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
-from sim.effects.setting import AERODYNAMICS, generalised
+from sim.effects.setting import AERODYNAMICS, generalise
 from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
@@ -177,14 +177,14 @@ def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
     vehicle = setting.plant.vehicle
     bare = replace(vehicle, aero=replace(vehicle.aero, kind="none"))
     plant = replace(setting.plant, vehicle=bare)
-    aero = generalised(replace(setting, plant=plant)).plant.vehicle.aero
+    aero = generalise(replace(setting, plant=plant)).plant.vehicle.aero
     assert aero.kind == "rotor_drag"
     assert not any(getattr(aero, name) for name in AERODYNAMICS)
 
 
 def test_the_catalogue_is_sound():
     plant = replace(
-        generalised(setting_with({})),
+        generalise(setting_with({})),
         camera=load_experiment("state").camera,
     )
     for name, e in catalogue().items():

@@ -24,7 +24,7 @@ from hil.poses.pose import Pose
 from tests.configs import load_run
 from tests.hil_flight import OURS
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.calibration import Calibration, Hovered, Spreads, solved
+from visthrow.onboard.calibration import Calibration, Hovered, Spreads, try_calibration
 from visthrow.onboard.observations import rotation_from_quat
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.loading import load_policy
@@ -123,7 +123,7 @@ class Hall:
                 self.runner.estimator.take_detections([self.detection(now)])
             if (due := self.runner.calibrating.due()) is not None:
                 p = self.runner.params
-                self.runner.commander.calibration = solved(
+                self.runner.commander.calibration = try_calibration(
                     due, p.camera, self.runner.pilot.policy.contract, p.calibration.spreads
                 )
             decision = self.runner.tick(
@@ -252,8 +252,8 @@ def test_a_hover_that_shows_too_little_is_reported():
         np.zeros((rows, 8), bool),
         np.array([2.0, 0.0, 0.0]),
     )
-    assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in solved(
+    assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in try_calibration(
         hovered, params.camera, contract, Spreads()
     )
     broken = replace(hovered, valid=np.ones((rows, 8), bool), thrust=np.full(rows, 1e150))
-    assert "no finite answer" in str(solved(broken, params.camera, contract, Spreads()))
+    assert "no finite answer" in str(try_calibration(broken, params.camera, contract, Spreads()))

@@ -81,7 +81,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
         points, valid = keypoints(camera, pos, rot, goal, payload)
         seen = points.flatten(1)
     frame = torch.cat([ob.vehicle_part(pos, zero, zero, rot), seen], dim=-1)
-    place, weight = goal_motion.measured_goal(layout, frame, valid, camera)
+    place, weight = goal_motion.measure_goal(layout, frame, valid, camera)
     known = weight > 0
     assert known.float().mean() > 0.9
     assert_allclose(
@@ -98,7 +98,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
         points, valid = keypoints(
             camera, above[:, :3], torch.eye(3)[None], over, torch.tensor([[0.0, 0.0, 1.5]])
         )
-        _, weight = goal_motion.measured_goal(
+        _, weight = goal_motion.measure_goal(
             layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera
         )
         assert weight.item() == approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
@@ -117,7 +117,7 @@ def test_a_located_state_layout_has_the_mean_goal():
         seen.append(goal + 0.05 * rng.standard_normal(2))
         frame[0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(seen[-1]) - frame[0, :2]
         time = torch.full((1,), step * PERIOD)
-        sums, _, places, kept, _ = goal_motion.fitted_goal(
+        sums, _, places, kept, _ = goal_motion.update_goal_fit(
             layout, frame, None, None, sums, time, fresh
         )
         fresh = torch.zeros_like(fresh)

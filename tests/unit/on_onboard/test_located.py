@@ -12,7 +12,7 @@ from camera.mount import rotation_from_vector
 from tests.configs import load_experiment
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.goal_motion import fitted_goal
+from visthrow.onboard.goal_motion import update_goal_fit
 
 EXACT = 2e-3
 """Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre
@@ -42,7 +42,9 @@ def scene():
 def places(layout, frame, valid, camera):
     """Of a throw's first frame."""
     begin = torch.zeros(len(frame)), torch.ones(len(frame), dtype=torch.bool)
-    return fitted_goal(layout, frame, valid, camera, goal_motion.empty_sums(len(frame)), *begin)[2]
+    return update_goal_fit(
+        layout, frame, valid, camera, goal_motion.empty_sums(len(frame)), *begin
+    )[2]
 
 
 def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
@@ -51,13 +53,13 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     off = []
     for k in range(40):
         noisy = frame + 0.01 * torch.randn_like(frame)
-        sums, _, found, _, _ = fitted_goal(
+        sums, _, found, _, _ = update_goal_fit(
             layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
         )
         off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
         fresh = torch.zeros_like(fresh)
     assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
-    _, _, blind, shown, counts = fitted_goal(
+    _, _, blind, shown, counts = update_goal_fit(
         layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh
     )
     assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
@@ -78,7 +80,7 @@ def test_a_goal_that_moves_is_where_it_is_now():
     for k in range(60):  # the vehicle moves with the goal: what it sees stays as it is
         moved = frame.clone()
         moved[:, :2] += speed * 0.02 * k
-        sums, velocity, found, _, _ = fitted_goal(
+        sums, velocity, found, _, _ = update_goal_fit(
             layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
         )
         fresh = torch.zeros_like(fresh)

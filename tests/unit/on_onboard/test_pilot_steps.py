@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from tests.hil_flight import simple_policy
-from visthrow.onboard.observations import RESPONSE, resampled
+from visthrow.onboard.observations import RESPONSE, resample
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 
@@ -74,7 +74,7 @@ def test_a_response_with_gaps_is_that_of_regular_steps(times):
 
 def test_what_is_older_than_the_throw_is_its_first_step():
     history = torch.tensor([[[4.0], [1.0], [1.0], [1.0]]])
-    found = resampled(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
+    found = resample(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
     assert found[0, :, 0].tolist() == approx([6.0, 4.0, 1.0, 1.0])
 
 
@@ -83,8 +83,8 @@ def test_a_release_that_was_not_done_is_not_reported():
     before = pilot.previous_action[0, 4]
     seen(pilot, 0.0, 0.0)
     assert pilot.previous_action[0, 4] == 1.0
-    pilot.not_released()
+    pilot.cancel_release()
     assert pilot.previous_action[0].tolist() == approx([-0.1, 0.3, 0.0, 0.0, before])
     seen(pilot, PERIOD, PERIOD)
-    pilot.not_released()
+    pilot.cancel_release()
     assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"

@@ -6,7 +6,7 @@ from itertools import combinations
 from pytest import approx, mark, raises
 
 from sim.effects.effect import Change, Lowest, apply, possible_together
-from sim.effects.setting import Setting, generalised
+from sim.effects.setting import Setting, generalise
 from tests.plants import paper_plant
 from visthrow.config.effects import catalogue
 
@@ -26,7 +26,7 @@ def test_the_lower_bound_leaves_what_the_limit_says(share, factor, least):
 
 
 def test_two_effects_together_keep_every_number_of_the_plant_within_its_bounds():
-    setting = generalised(Setting(paper_plant()))
+    setting = generalise(Setting(paper_plant()))
     effects = {
         name: effect.bounded(setting)
         for name, effect in catalogue().items()
@@ -38,7 +38,7 @@ def test_two_effects_together_keep_every_number_of_the_plant_within_its_bounds()
 
 
 def test_an_effect_takes_what_others_leave_of_a_number():
-    setting = generalised(Setting(paper_plant()))
+    setting = generalise(Setting(paper_plant()))
     names = "rotor_drag", "rotor_drag_z"
     effects = {name: catalogue()[name].bounded(setting) for name in names}
     drag = setting.plant.vehicle.aero.drag_z

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from pytest import approx, raises
 
-from sim.effects.firmware import calibrated_voltage, controller_of, left_out
+from sim.effects.firmware import calibrated_voltage, controller_of, missing_features
 from tests.plants import paper_plant
 
 SETTINGS = {
@@ -58,9 +58,9 @@ def test_the_voltage_of_a_hover():
 
 
 def test_what_the_block_has_no_number_for_is_reported():
-    told = left_out(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
+    told = missing_features(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
     assert [text.split()[0] for text in told] == ["tpa_rate", "d_max"]
-    assert left_out(SETTINGS | {"d_max": "0,0,0"}) == []
+    assert missing_features(SETTINGS | {"d_max": "0,0,0"}) == []
 
 
 def test_settings_that_are_missing_are_named():

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import fixture, raises
 from scipy.spatial.transform import Rotation
 
-from sim.effects.setting import Setting, generalised
+from sim.effects.setting import Setting, generalise
 from sim.hybrid import HybridSim
 from sim.kernels.replay import kernel as rk
 from sim.kernels.replay.lanes import _BUILDS, Recording, Replay
@@ -110,7 +110,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
         "skip": -1,
     } | lane
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
-    plants = [generalised(Setting(p)).plant for p in plants]  # as a diagnosis flies them
+    plants = [generalise(Setting(p)).plant for p in plants]  # as a diagnosis flies them
     engine = Replay(plants, sensings or [SensingParams()] * len(plants))
     flown = engine.run(
         start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9

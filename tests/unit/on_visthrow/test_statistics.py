@@ -36,7 +36,7 @@ def test_two_levels_carry_the_scatter_of_the_runs():
     """
     rng = default_rng(2)
     groups = [rng.normal(m, 0.01, 50) for m in (0.02, 0.03, 0.05, 0.06)]
-    samples = st._resampled(groups, default_rng(0), 40000)
+    samples = st._resample(groups, default_rng(0), 40000)
     means = np.array([g.mean() for g in groups])
     expected = (means.var() + np.mean([g.var() for g in groups]) / 50) / 4
     assert samples.var() == approx(expected, rel=0.04)
@@ -65,7 +65,7 @@ def test_pairs_remove_what_both_share():
     shared = rng.normal(0.0, 0.1, 200)
     a, b = shared + rng.normal(0.01, 0.005, 200), shared + rng.normal(0.0, 0.005, 200)
     a[3] = np.nan
-    pair, alone = st.paired(a, b), st.difference(a[np.isfinite(a)], b)
+    pair, alone = st.compare_pairs(a, b), st.difference(a[np.isfinite(a)], b)
     assert 0.01 in pair
     assert (pair.high - pair.low) < 0.2 * (alone.high - alone.low)
 

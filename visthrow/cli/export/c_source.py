@@ -6,7 +6,7 @@ from torch import Tensor
 
 from visthrow.common.storage import atomic_write
 from visthrow.onboard.policy import Policy, named_activation
-from visthrow.view.templates import rendered
+from visthrow.view.templates import render
 
 
 def write_c(policy: Policy, path: str | Path) -> None:
@@ -20,7 +20,7 @@ def write_c(policy: Policy, path: str | Path) -> None:
     scale = None
     if policy.mean is not None and policy.std is not None:
         scale = policy.std + policy.eps
-    source = rendered(
+    source = render(
         Path(__file__).with_name("policy.c.j2"),
         {"array": _array},
         policy=policy,

@@ -137,16 +137,16 @@ def random_scenes(
     hanging = d.uniform(0.33, 0.42, 1)
     ball = pos + way * torch.where(thrown, flown, hanging)
     ball[:, 2].clamp_(min=params.payload_radius)
-    scenes = posed_scenes(params, pos, rot_wb, ball, goal, ~thrown[:, 0])
+    scenes = make_plain_scenes(params, pos, rot_wb, ball, goal, ~thrown[:, 0])
     vel = d.normal(1.2, 3)
     rates = d.normal(2.5, 3)
     scenes.pose[:, 7:] = torch.cat([vel, rates], -1)
     scenes.ball[:, 4:7] = vel + d.normal(1.5, 3)
     scenes.goal[:, 3] = d.normal(0.05)
-    return dressed(scenes, d, textures, nuisances or Nuisances())
+    return draw_halls(scenes, d, textures, nuisances or Nuisances())
 
 
-def posed_scenes(
+def make_plain_scenes(
     params: CameraParams,
     pos_w: Tensor,
     rot_wb: Tensor,
@@ -189,7 +189,7 @@ def _flat(*columns: Tensor) -> Tensor:
     return torch.cat([c if c.dim() == rank else c[..., None] for c in columns], -1)
 
 
-def _exposed(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
+def _draw_sensors(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     """Return sensors and shutters drawn at random."""
     gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
     noise = n.noise * d.uniform(0.0, 1.0).square()
@@ -202,7 +202,7 @@ def _exposed(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     return sensor, _flat(exposure, readout, defocus)
 
 
-def _coloured(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
+def _draw_colours(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     """Return balls and goals with colours, sizes and turns drawn at random."""
     ball = scenes.ball.clone()
     goal = scenes.goal.clone()
@@ -252,10 +252,10 @@ def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     return _flat(direction, ambient, colour, d.uniform(0.2, 0.8))
 
 
-def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
+def draw_halls(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
     ground, walls = _hall(scenes, d, textures, n)
-    ball, goal = _coloured(scenes, d, n)
+    ball, goal = _draw_colours(scenes, d, n)
     light = _lit(scenes, d, n)
     rope = scenes.rope.clone()
     rope[:, 3] = rope[:, 3] * d.chance(n.parts)
@@ -263,7 +263,7 @@ def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     rope[:, 4:7] = d.uniform(0.05, 0.9, 1)
     lens = scenes.lens.clone()
     lens[:, 9] = n.light * d.uniform(0.0, 2.0)
-    sensor, shutter = _exposed(scenes.count, d, n)
+    sensor, shutter = _draw_sensors(scenes.count, d, n)
     things = _things(scenes, d, n)
     return Scenes(
         lens, scenes.pose, shutter, ball, goal, ground, walls, light, rope, sensor, things
@@ -344,7 +344,7 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
         pixels, visible = lens.project(static_c)
         row = (pixels[..., 1:2] + 0.5) / lens.params.height - 0.5
         time = row * scenes.shutter[:, None, 1:2].double()
-    visible = visible & lens.on_sensor(pixels)
+    visible = visible & lens.is_on_sensor(pixels)
     ball_c = static_c[:, 4]
     extremes_c = ball_extremes_c(lens, ball_c, float(scenes.ball[0, 3]))
     _, sides = lens.project_normalized(extremes_c)

@@ -49,7 +49,7 @@ def theta_d(theta: float, k: wp.vec4) -> float:
 
 
 @wp.func
-def in_axes(x: float, y: float, yaw: float) -> wp.vec2:
+def turn_axes(x: float, y: float, yaw: float) -> wp.vec2:
     """A place on axes that are turned by an angle."""
     c = wp.cos(yaw)
     s = wp.sin(yaw)
@@ -68,7 +68,7 @@ def angle_of(radius: float, k: wp.vec4, limit: float) -> float:
 
 
 @wp.func
-def mirrored(x: float) -> float:
+def mirror(x: float) -> float:
     """A coordinate folded into 0 to 1: photographs do not tile, their mirror images do."""
     y = x - 2.0 * wp.floor(0.5 * x)
     return wp.where(y > 1.0, 2.0 - y, y)
@@ -109,8 +109,8 @@ def texture(
     for _ in range(level):
         base += size * size * 3
         size = size / 2
-    x = mirrored(u) * float(size - 1)
-    y = mirrored(v) * float(size - 1)
+    x = mirror(u) * float(size - 1)
+    y = mirror(v) * float(size - 1)
     i = int(x)
     j = int(y)
     a = x - float(i)
@@ -175,7 +175,7 @@ def thing_over(thing: ThingRow, point: wp.vec3, below: wp.vec3) -> wp.vec3:
     kind = int(thing.kind)
     if kind != 1 and kind != 2:
         return below
-    place = in_axes(point[0] - thing.place[0], point[1] - thing.place[1], thing.yaw)
+    place = turn_axes(point[0] - thing.place[0], point[1] - thing.place[1], thing.yaw)
     lateral = place[0] / thing.size[0]
     axial = place[1] / thing.size[1]
     reach = wp.max(wp.abs(lateral), wp.abs(axial))
@@ -186,9 +186,7 @@ def thing_over(thing: ThingRow, point: wp.vec3, below: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def shadowed(
-    colour: wp.vec3, point: wp.vec3, body: wp.vec3, size: float, light: LightRow
-) -> wp.vec3:
+def shade(colour: wp.vec3, point: wp.vec3, body: wp.vec3, size: float, light: LightRow) -> wp.vec3:
     """A colour of the ground in the soft shadow of a round body."""
     x = point[0] - body[0] + light.dir[0] / light.dir[2] * body[2]
     y = point[1] - body[1] + light.dir[1] / light.dir[2] * body[2]
@@ -198,7 +196,7 @@ def shadowed(
 
 
 @wp.func
-def on_ground(
+def ground_colour(
     scene: SceneRow,
     things: Things,
     textures: Textures,
@@ -213,7 +211,7 @@ def on_ground(
     """
     ground = scene.ground
     point = eye + ray * depth
-    tile = in_axes(point[0], point[1], ground.yaw) / ground.tile + ground.offset
+    tile = turn_axes(point[0], point[1], ground.yaw) / ground.tile + ground.offset
     pixel = 1.0 / scene.lens.focus[0]
     footprint = depth * pixel / (wp.max(-ray[2], 0.03) * ground.tile)
     colour = texture(textures, int(ground.texture), tile[0], tile[1], footprint, chance)
@@ -221,28 +219,28 @@ def on_ground(
     for i in range(things.shape[1]):
         colour = thing_over(things[e, i], point, colour)
     goal = scene.goal
-    place = in_axes(point[0] - goal.place[0], point[1] - goal.place[1], goal.yaw)
+    place = turn_axes(point[0] - goal.place[0], point[1] - goal.place[1], goal.yaw)
     colour = square(place[0], place[1], goal, colour)
-    colour = shadowed(colour, point, scene.ball.centre, scene.ball.radius, scene.light)
-    colour = shadowed(colour, point, eye, VEHICLE_RADIUS, scene.light)
+    colour = shade(colour, point, scene.ball.centre, scene.ball.radius, scene.light)
+    colour = shade(colour, point, eye, VEHICLE_RADIUS, scene.light)
     return colour * lit(wp.vec3(0.0, 0.0, 1.0), scene.light)
 
 
 @wp.func
-def to_wall(half: float, eye: float, ray: float) -> float:
+def wall_distance(half: float, eye: float, ray: float) -> float:
     """Distance along a ray to one of two opposite walls, from numbers of one axis."""
     wall = wp.where(ray > 0.0, half, -half)
     return (wall - eye) / wp.where(wp.abs(ray) < 1.0e-6, 1.0e-6, ray)
 
 
 @wp.func
-def on_walls(
+def wall_colour(
     scene: SceneRow, textures: Textures, eye: wp.vec3, ray: wp.vec3, chance: float
 ) -> wp.vec3:
     """Walls and ceiling of the hall, a box with a photograph on each side."""
     walls = scene.walls
-    tx = to_wall(walls.half, eye[0], ray[0])
-    ty = to_wall(walls.half, eye[1], ray[1])
+    tx = wall_distance(walls.half, eye[0], ray[0])
+    ty = wall_distance(walls.half, eye[1], ray[1])
     tz = wp.where(ray[2] > 1.0e-4, (walls.height - eye[2]) / wp.max(ray[2], 1.0e-4), 1.0e9)
     depth = wp.min(wp.min(tx, ty), tz)
     point = eye + ray * depth
@@ -287,10 +285,10 @@ def radiance(
     ball = scene.ball
     if ray[2] < -1.0e-4:
         depth = -eye[2] / ray[2]
-        colour = on_ground(scene, things, textures, e, eye, ray, depth, chance)
+        colour = ground_colour(scene, things, textures, e, eye, ray, depth, chance)
     else:
         depth = 1.0e8
-        colour = on_walls(scene, textures, eye, ray, chance)
+        colour = wall_colour(scene, textures, eye, ray, chance)
     for i in range(things.shape[1]):
         thing = things[e, i]
         if int(thing.kind) == 3:

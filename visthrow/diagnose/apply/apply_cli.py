@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from visthrow import config
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 
 if TYPE_CHECKING:
     from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

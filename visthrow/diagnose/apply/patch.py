@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from sim.effects.effect import apply
-from sim.effects.firmware import calibrated_voltage, controller_of, left_out
-from sim.effects.setting import Setting, generalised, specialised
+from sim.effects.firmware import calibrated_voltage, controller_of, missing_features
+from sim.effects.setting import Setting, generalise, specialise
 from sim.kernels.laws import check_laws
 from sim.params import GRAVITY, LawParams
 from visthrow import config
@@ -32,9 +32,9 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
 
     Raises ConfigError: an effect that the catalogue does not hold.
     """
-    base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
+    base = generalise(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     sizes = apply(chosen(theta), base, theta)
-    plant = specialised(sizes.plant, plant_of(experiment))
+    plant = specialise(sizes.plant, plant_of(experiment))
     return dataclasses.replace(
         experiment,
         vehicle=plant.vehicle,
@@ -169,7 +169,7 @@ def with_firmware(
         f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()}"
         f" in {Path(path).name}."
     ]
-    lines += [f"# Not in the block: {words}." for words in left_out(settings)]
+    lines += [f"# Not in the block: {words}." for words in missing_features(settings)]
     vehicle = {"controller": changed} | ({} if delay is None else {"queue": {"delay": delay}})
     return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])
 

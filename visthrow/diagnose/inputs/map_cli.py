@@ -5,10 +5,10 @@ could not know as questions.
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import LogError
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

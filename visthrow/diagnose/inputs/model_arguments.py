@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select.result import NAMED, Diagnosis
@@ -19,17 +19,17 @@ DEFAULT_PLANT = "state"
 THROW = "throw"  # name of the model that is no setup's own: the whole throw
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def declared_with_logs(module: str) -> Callable[[argparse.ArgumentParser], None]:
     """Return a command's ``add_arguments``: those of logs and model, then the command's, as of
-    `visthrow.common.arguments.declared`.
+    `visthrow.common.arguments.declare`.
     """
 
     def add_all(parser: argparse.ArgumentParser) -> None:
         add_arguments(parser)
-        declared(module)(parser)
+        declare(module)(parser)
 
     return add_all
 

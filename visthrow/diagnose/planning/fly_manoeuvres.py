@@ -11,7 +11,7 @@ import numpy as np
 
 from sim.effects.effect import apply
 from sim.params import PlantParams, changed
-from sim.scaling.units import Units, in_units
+from sim.scaling.units import Units, convert_units
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
@@ -156,8 +156,8 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     """
     ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
-    vehicle = in_units(plant.vehicle, alike)
-    rope = in_units(plant.rope, alike)
+    vehicle = convert_units(plant.vehicle, alike)
+    rope = convert_units(plant.rope, alike)
     values = {f"aero.{f.name}": 0.0 for f in fields(vehicle.aero) if f.name != "kind"}
     values |= {
         "aero.drag_x": params.drag_xy,

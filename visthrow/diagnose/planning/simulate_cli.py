@@ -5,13 +5,13 @@ motion capture does.
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import DiagnoseError
 
 NOISE = {"pos_w": 5e-4, "quat_wb": 3.5e-3, "payload_pos_w": 8e-4}
 """Of the recorded poses, standard deviations [m], [rad], [m]: motion capture of a hall."""
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

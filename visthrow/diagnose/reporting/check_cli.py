@@ -4,9 +4,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

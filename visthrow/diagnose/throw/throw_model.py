@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from camera.params import CameraParams
 from sim.effects.effect import SettingEffect, apply, possible_together
-from sim.effects.setting import Setting, generalised
+from sim.effects.setting import Setting, generalise
 from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
@@ -94,7 +94,7 @@ class ThrowModel(Model):
                 compiles a kernel.
             camera: whose keypoints the logs hold.
         """
-        self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
+        self.setting = generalise(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device = device
         self.substep = substep
         flights = [record_of(log, i) for i, log in enumerate(logs)]

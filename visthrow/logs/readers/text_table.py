@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from visthrow.common.storage import counted
+from visthrow.common.storage import count_lines
 from visthrow.common.toml_text import tables_beside
 
 MARKS = (",", ";", "\t", " ")
@@ -91,7 +91,7 @@ def layout_of(text: str, name: str = "") -> TextTable:
 def _cells(text: str, mark: str, name: str) -> Rows:
     """Cells of each line that holds any."""
     blank = mark == " "
-    lines = counted(io.StringIO(text, newline=""), len(text), name)
+    lines = count_lines(io.StringIO(text, newline=""), len(text), name)
     reader = csv.reader(lines, delimiter=mark, skipinitialspace=blank)
     rows = []
     for cells in reader:

@@ -20,7 +20,7 @@ from visthrow.paper.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.paper.baseline.pendulum_model import Pendulum
 from visthrow.paper.baseline.throw_plan import ThrowPlan, landing_point
 from visthrow.task import Experiment
-from visthrow.task.measurement import Throws, pilots_hover, without_failed
+from visthrow.task.measurement import Throws, blank_failed, pilots_hover
 from visthrow.throws.flight_loop import (
     FALL_TIME,
     Decision,
@@ -58,7 +58,7 @@ class Flown(Throws):
     step_times: ndarray  # of all steps of the controller [s], shape (K,)
 
 
-def _flown(
+def _results_of(
     plan: ThrowPlan,
     success: ndarray,
     separated: tuple[ndarray, ndarray] | ndarray,
@@ -71,11 +71,11 @@ def _flown(
     pos_w, vel_w = separated
     columns["position_error"] = np.linalg.norm(pos_w - plan.release.pos_w, axis=1)
     columns["velocity_error"] = np.linalg.norm(vel_w - plan.release.vel_w, axis=1)
-    columns = without_failed(success, columns)
+    columns = blank_failed(success, columns)
     return Flown(plan.target, success, **columns, step_times=np.array(step_times))
 
 
-def _normalised(params: MPCParams, command: ndarray) -> ndarray:
+def _normalise(params: MPCParams, command: ndarray) -> ndarray:
     """Commands (E, 4) as a policy puts them out."""
     throttle = np.sqrt(np.clip(command[:, :1], 0.0, params.max_thrust) / params.max_thrust)
     return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
@@ -122,7 +122,7 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
     smoothness = np.full(count, np.nan)
     for e in range(count):
         controller.reset()
-        change = Smoothness(_normalised(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1]))
+        change = Smoothness(_normalise(params, pm.hover(plan.model, state[e : e + 1, pm.POS])[1]))
         try:
             for k in range(steps):
                 off = state[e, pm.POS] - reference[0][k, pm.POS]
@@ -131,7 +131,7 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
                     state[e], (reference[0][k : k + horizon + 1], reference[1][k : k + horizon])
                 )
                 times.append(controller.step_time)
-                change.add(_normalised(params, command[None]))
+                change.add(_normalise(params, command[None]))
                 good[e] &= pm.tension(plan.model, state[e], command) > 0.0
                 state[e] = pm.step(
                     plan.model, state[e], command, params.period if k < steps - 1 else last, FINE
@@ -141,7 +141,7 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
         smoothness[e] = change.value[0]
     point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], plan.release.landing_height)
     good &= np.isfinite(fall)
-    return _flown(
+    return _results_of(
         plan,
         good,
         (state[:, pm.POS], state[:, pm.VEL]),
@@ -224,7 +224,7 @@ def look_ahead(
     return state
 
 
-def _started(
+def _start_plant(
     name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
 ) -> tuple[Plant, ndarray]:
     """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
@@ -267,7 +267,7 @@ class Controllers(Pilots):
         self._reference = plan.reference(delays.command, period, self.most + self.params.stages)
         self._hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
         goal_w = np.tile([plan.target, 0.0, 0.0], (count, 1))
-        super().__init__(experiment, goal_w, _normalised(self.params, self._hover))
+        super().__init__(experiment, goal_w, _normalise(self.params, self._hover))
         self._estimate: ndarray | None = None
         self._period = 0
 
@@ -283,7 +283,7 @@ class Controllers(Pilots):
         )
         span = self.delays.measurement + self.delays.command
         state = look_ahead(
-            self.plan.model, self._estimated(snapshot, sent, span), sent, self.period, span
+            self.plan.model, self._estimate(snapshot, sent, span), sent, self.period, span
         )
         reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
         for e in np.flatnonzero(flight.flown):
@@ -294,10 +294,10 @@ class Controllers(Pilots):
                 flight.fail(e, str(error))
         self._period += 1
         return Decision(
-            command, np.full(len(command), k >= self.latch), _normalised(self.params, command)
+            command, np.full(len(command), k >= self.latch), _normalise(self.params, command)
         )
 
-    def _estimated(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
+    def _estimate(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
         """State now: the model's prediction from the period before, corrected by what
         is measured.
         """
@@ -353,7 +353,7 @@ class _Tracking(Scores):
         columns["tracking"] = np.sqrt(self._sum / np.maximum(self._due, 1))
         plan = self.pilots.plan
         success = columns.pop("success")
-        return _flown(plan, success, self.separated, self.pilots.times, **columns)
+        return _results_of(plan, success, self.separated, self.pilots.times, **columns)
 
 
 def fly_plant(
@@ -372,7 +372,7 @@ def fly_plant(
     simulator the same vehicles, ropes and starts as :func:`visthrow.training.protocol.throw`, on a
     reference plant the same vehicles, winds and starts as batch ``batch`` of
     :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller."""
-    plant, home = _started(plant_name, experiment, plan.target, batch, count, seed, device)
+    plant, home = _start_plant(plant_name, experiment, plan.target, batch, count, seed, device)
     pilots = Controllers(plan, experiment, plant.period, delays, count)
     flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)
     before = [] if plant_name == "hybrid" else [hover(HOVER_TIME)]

@@ -136,7 +136,7 @@ class MPC:
         if self._states is None:
             self._states = target.copy()
             self._inputs = effort.copy()
-        state, *target = _same_side(
+        state, *target = _align_signs(
             np.vstack([state, target]), np.vstack([self._states[:1], self._states])
         )
         target = np.array(target)
@@ -193,7 +193,7 @@ class MPC:
             self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
 
 
-def _same_side(target: ndarray, reference: ndarray) -> ndarray:
+def _align_signs(target: ndarray, reference: ndarray) -> ndarray:
     """Quaternions with the signs of others': q and -q are one attitude."""
     target = target.copy()
     sign = np.sign((target[:, QUAT] * reference[:, QUAT]).sum(1))

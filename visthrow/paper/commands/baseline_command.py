@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.workers import status
 
 POLICY_THROWS = 100  # throws of each learnt policy for its point on the front
@@ -21,7 +21,7 @@ NOTE = (
 )
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,27 +32,27 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.paper.report import result_set, trade
     from visthrow.paper.report.result_set import SHORT
     from visthrow.throws import results
-    from visthrow.throws.plants import known_plant
+    from visthrow.throws.plants import check_plant
     from visthrow.view import page
     from visthrow.view.parts import Section
 
     compare.check(args.targets, args.throws)
     for plant in args.plants:
-        known_plant(plant)
+        check_plant(plant)
     out = Path(args.out)
     bounds = thrower.BOUNDS[args.payload_bounds]
     writable(out)
     if args.quick:
         args.throws = min(args.throws, 2)
         args.plants = []
-    by_target = list(_by_target(args, bounds))
+    by_target = list(_list_units(args, bounds))
     swept = [] if args.no_sweep else list(_swept(args, bounds))
     flights = thrower.flown(by_target + swept, out / "throws", status)
     rows = flights[: len(by_target)]
     front = flights[len(by_target) :]
     document = [Section("baseline", "By target", (trade.by_target(rows),))]
     if swept:
-        policies = [_thrown(name, args) for name in args.policies]
+        policies = [_throw(name, args) for name in args.policies]
         kinds = [(thrower.IDEAL, "none"), *((plant, "both") for plant in args.plants)]
         panels = [
             {
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _how(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
+def _describe(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
     return {
         "bounds": bounds,
         "config_name": args.config,
@@ -87,7 +87,7 @@ def _how(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
     }
 
 
-def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+def _list_units(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
     """Units of each row: the own model first, then each plant under each compensation."""
     from visthrow.paper.baseline import thrower
 
@@ -96,7 +96,7 @@ def _by_target(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str,
         height, speed = releases.get(target, (None, None))
         for row in thrower.rows(args.plants):
             yield thrower.units(
-                *row, target, args.throws, height=height, speed=speed, **_how(args, bounds)
+                *row, target, args.throws, height=height, speed=speed, **_describe(args, bounds)
             )
 
 
@@ -113,7 +113,7 @@ def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any
                 (thrower.IDEAL, "none"),
                 *((plant, "both") for plant in args.plants),
             ]:
-                how = {"speed": speed, "w_t": w_t, "rho": rho, **_how(args, bounds)}
+                how = {"speed": speed, "w_t": w_t, "rho": rho, **_describe(args, bounds)}
                 yield thrower.units(plant, made_up, front.FRONT_TARGET, args.throws, **how)
 
 
@@ -128,7 +128,7 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
     return {target: measure(loaded, target, seed=args.seed) for target in args.targets}
 
 
-def _thrown(name: str, args: argparse.Namespace) -> Any:
+def _throw(name: str, args: argparse.Namespace) -> Any:
     """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
     from visthrow.cli.compare import throw_hybrid
     from visthrow.paper.baseline.front import FRONT_TARGET

@@ -4,7 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import declare
 from visthrow.common.errors import StorageError
 
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
@@ -18,7 +18,7 @@ LEAD = (
 """The page's introduction."""
 
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import EXIT_INTERRUPTED, declared
+from visthrow.common.arguments import EXIT_INTERRUPTED, declare
 from visthrow.common.errors import ConfigError
 
-add_arguments = declared(__file__)
+add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

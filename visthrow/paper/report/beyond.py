@@ -92,7 +92,7 @@ def _speeds(thrown: ResultSet, policy: str, plant: str) -> Points:
     """Return ascending speeds of the target [m/s] and a policy's throws."""
     points = [
         (float(speed[1]), result)
-        for speed, result in thrown.by_departure(policy, SPEED_KEY, plant, TARGET)
+        for speed, result in thrown.throws_by_value(policy, SPEED_KEY, plant, TARGET)
         if speed[0] == speed[1]
     ]
     return sorted(points, key=lambda point: point[0])

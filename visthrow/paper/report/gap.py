@@ -78,7 +78,11 @@ def section(thrown: ResultSet) -> Section:
         curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
         content += [curves, Grid.from_rows("The curves in figures", header, rows)]
     return parts.section(
-        "gap", "What vision costs, and why", *content, *_trained(thrown, missing), missing=missing
+        "gap",
+        "What vision costs, and why",
+        *content,
+        *_list_trained(thrown, missing),
+        missing=missing,
     )
 
 
@@ -88,7 +92,7 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
     """
     points = {
         round(sweep.scale * float(np.mean(value)), 9): r
-        for value, r in thrown.by_departure(policy, sweep.key, PLANT, TARGET)
+        for value, r in thrown.throws_by_value(policy, sweep.key, PLANT, TARGET)
     }
     nominal = thrown.shipped(policy, PLANT, TARGET)
     if nominal is not None and points:
@@ -106,7 +110,7 @@ def _rows(sweep: GapSweep, points: Points) -> Iterator[dict[str, str]]:
         yield row | {"imperfection": f"{sweep.title}, {sweep.xlabel}"}
 
 
-def _trained(thrown: ResultSet, missing: list[str]) -> list:
+def _list_trained(thrown: ResultSet, missing: list[str]) -> list:
     """Vision policies that were trained with other sight, each in its own simulator and on the
     reference plant.
     """

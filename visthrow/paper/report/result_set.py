@@ -82,7 +82,7 @@ class ResultSet:
             if all(r.unit.get(name) == value for name, value in conditions.items())
         ]
 
-    def by_departure(
+    def throws_by_value(
         self, policy: str, key: str, plant: str, target: float
     ) -> list[tuple[Any, Result]]:
         """Return a policy's throws with one value of the config changed, where any landed: the

@@ -142,7 +142,7 @@ def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
         vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target")
     )
     if len(vision) == len(state) == 1 and alike:
-        return st.paired(vision[0].columns[name], state[0].columns[name])
+        return st.compare_pairs(vision[0].columns[name], state[0].columns[name])
     return st.difference([r.of(name) for r in vision], [r.of(name) for r in state])
 
 

@@ -71,12 +71,12 @@ def baseline_section(thrown: ResultSet) -> Section:
 def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Result | None:
     """Throws at the speed and with the weights of the throws by target, the most there are."""
     selected = [
-        r for r in _of_baseline(thrown, plant, target, compensation=compensation) if _default(r)
+        r for r in _find_baseline(thrown, plant, target, compensation=compensation) if _default(r)
     ]
     return max(selected, key=lambda r: r.unit["throws"], default=None)
 
 
-def _of_baseline(
+def _find_baseline(
     thrown: ResultSet, plant: str, target: float = FRONT_TARGET, **conditions: str
 ) -> list[Result]:
     return thrown.matching(kind="baseline", plant=plant, target=target, **conditions)
@@ -125,7 +125,7 @@ def _steps() -> Iterator[Grid | Text | None]:
         cpu = record["provenance"]["processors"]["cpu"]
         (table,) = record["tables"]
         title = f"Step of the controller, one core of an {cpu}"
-        note = f"{measurements.made_by(record)}. {record['notes'][0]}"
+        note = f"{measurements.provenance_of(record)}. {record['notes'][0]}"
         header = " | ".join(table["header"])
         yield Grid.from_rows(title, header, map(tuple, table["rows"]), note, heads=2)
 
@@ -218,7 +218,7 @@ def _panel(
     policies = [(name, result) for name, result in shipped if result and result.good.any()]
     fronts = []
     for i, (compensation, bounds) in enumerate(kinds):
-        selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
+        selected = _swept(_find_baseline(thrown, plant, compensation=compensation, bounds=bounds))
         label = f"TO+MPC, bounds on {bounds}"
         late = ", release lag not made up for" if compensation == "delay" else ""
         entry = (i, label + late, points_of(selected))
@@ -226,7 +226,7 @@ def _panel(
             label += f", {thrower.MADE_UP[compensation]}"
         if selected:
             fronts.append(entry)
-            sums.append(_summed(title, label, selected))
+            sums.append(_summarise(title, label, selected))
             sentences += _verdicts(title, label, selected, policies, policies_on)
         elif (plant, bounds) != ("reference-realistic", BOUNDS[1]):
             missing.append(f"{title}, {label}")
@@ -278,7 +278,7 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
     return st.Interval(value, float(low), float(high))
 
 
-def _summed(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:
+def _summarise(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:
     points = points_of(selected)
     volume = hypervolume(selected)
     head = (title, label, str(len(selected)), str(len(points)))
@@ -345,7 +345,7 @@ def _count(points: Sequence) -> str:
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
     """Return the paper's table of settings, and ours of the own model."""
-    selected = _swept(_of_baseline(thrown, thrower.IDEAL))
+    selected = _swept(_find_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None
     rows = []

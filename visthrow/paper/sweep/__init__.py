@@ -9,7 +9,7 @@ from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.throws.plants import known_plant
+from visthrow.throws.plants import check_plant
 
 Changes = tuple[str, ...]
 """Changes of a config, ``key=value`` each."""
@@ -33,7 +33,7 @@ class ThrowParams(Bounded):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        known_plant(self.plant)
+        check_plant(self.plant)
         if self.count < 1 or not self.targets:
             raise ConfigError(
                 f"{self.count} throws at the targets {self.targets}; expected 1 or more of each"

@@ -193,7 +193,7 @@ class ProcessPool:
                 self._wait[task.name] = time.monotonic() + BUSY_PAUSE
             elif status != 0:
                 self.outcome.failed[task.name] = (
-                    last_line(task.log(self.out)) or f"exit status {status}"
+                    read_last_line(task.log(self.out)) or f"exit status {status}"
                 )
                 self.say(f"{task.name} FAILED: {self.outcome.failed[task.name]}")
             elif task.gpu:
@@ -216,7 +216,7 @@ class ProcessPool:
         return [handle for *_, handle in self._running.values() if handle.poll() is None]
 
 
-def last_line(log: Path) -> str:
+def read_last_line(log: Path) -> str:
     """Return the last line of what a task printed."""
     if log.exists():
         return log.read_text(errors="replace").strip().rpartition("\n")[2].strip()

@@ -184,5 +184,5 @@ def load(unit: ThrowUnit, out: Path) -> Loaded:
     """
     layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
     # a training's from the list: that of its file may have fields of another version
-    name, changes = unit.flown_in(layout)
+    name, changes = unit.flight_config(layout)
     return load_policy(unit.source.policy(out), name or None, changes, unit.params.allow)

@@ -129,9 +129,9 @@ class ThrowUnit:
             return {key: value for key, value in values.items() if key != "ppo"}
 
         nominal = stated(source.config, source.flown)
-        return nominal, stated(*self.flown_in(nominal["task"]["observation"]["layout"]))
+        return nominal, stated(*self.flight_config(nominal["task"]["observation"]["layout"]))
 
-    def flown_in(self, layout: str) -> tuple[str, Changes]:
+    def flight_config(self, layout: str) -> tuple[str, Changes]:
         """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its
         changes.
         """
@@ -196,7 +196,7 @@ def expand(name: str, params: SweepList) -> SweepWork:
         changes = params.changes + group.changes
         mark = f"{called}-" if group.changes else ""
         trained = [
-            _trained(item, mark, changes, seed, commit)
+            _make_training(item, mark, changes, seed, commit)
             for seed in group.seeds
             for item in group.configs
         ]
@@ -229,7 +229,7 @@ def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
     return changed
 
 
-def _trained(name: str, mark: str, changes: Changes, seed: int, commit: str) -> ResultSource:
+def _make_training(name: str, mark: str, changes: Changes, seed: int, commit: str) -> ResultSource:
     # without defaults, so that a field that is added later changes no key
     stated = config.to_dict(_experiment(name, changes), defaults=False)
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})

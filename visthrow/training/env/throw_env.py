@@ -19,7 +19,7 @@ from visthrow.common.compute_device import rounded_products
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment, drawn_plants, plant_of, rewards, terminations
+from visthrow.task import Experiment, draw_plants, plant_of, rewards, terminations
 from visthrow.task.fleet import Member, members
 from visthrow.training.env.options import FleetSetup, MovingGoals, PoseDelay
 
@@ -83,7 +83,7 @@ class ThrowEnv(VecEnv):
     def _build(self, fleet: list[Member], seed: int) -> tuple[list[RopeParams], int]:
         """Build the simulator; return its ropes, and how many of them each plant has."""
         experiment = self.cfg
-        plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
+        plants = [member.plant for member in fleet] or draw_plants(experiment, seed)
         start = experiment.task.start
         ropes = [rope for plant in plants for rope in rope_variants(plant.rope, start)]
         share = len(ropes) // len(plants)
@@ -233,7 +233,7 @@ class ThrowEnv(VecEnv):
         noisy = action[:, : act.COMMANDS] + noise + buffers["command_bias"]
         command = act.command_from_action(noisy, self._max_thrust, self.max_rate)
         self.views.command.copy_(command)
-        asked = act.release_asked(actions, self.cfg.release.threshold)
+        asked = act.wants_release(actions, self.cfg.release.threshold)
         self.views.release.copy_(asked & (not hold))
         with on_torch_stream(self.device):
             self.sim.step(mask)
@@ -273,7 +273,9 @@ class ThrowEnv(VecEnv):
         change = rewards.change(p, action, self.previous_action, self.change_weights)
         attached = kinetic + command + change
         margin = self.cfg.release.clearance_margin
-        at_release = rewards.at_release(p, error, out["time_to_impact"], out["clearance"], margin)
+        at_release = rewards.release_reward(
+            p, error, out["time_to_impact"], out["clearance"], margin
+        )
         reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period)
         reward = reward - p.termination * negative
         self.last = {
@@ -345,7 +347,7 @@ class ThrowEnv(VecEnv):
         goal_vel = places = answers = None
         setup = self._fleet.observed if self._fleet else None
         if self.layout.fits:
-            fitted = goal_motion.fitted_goal(
+            fitted = goal_motion.update_goal_fit(
                 self.layout, measured, valid, self.view.camera, buffers["goal_fit"], time, fresh
             )
             buffers["goal_fit"].copy_(fitted.sums)
@@ -368,11 +370,11 @@ class ThrowEnv(VecEnv):
             setup,
         )
         buffers["history"].copy_(history)
-        critic = self._privileged(actor, vehicle, payload, time, fresh)
+        critic = self._critic_view(actor, vehicle, payload, time, fresh)
         observed = {"actor": actor, "critic": critic}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
-    def _privileged(
+    def _critic_view(
         self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor
     ) -> Tensor:
         """Critic's view: what ``ppo.privileged`` names."""

@@ -42,7 +42,7 @@ class BackwardParams:
     decay: float  # of derivatives, per step
 
 
-def _at(kind: type) -> wp.Function:
+def _make_attach(kind: type) -> wp.Function:
     """Return the function that gives a value the derivatives of another."""
 
     @wp.func
@@ -56,7 +56,7 @@ def _at(kind: type) -> wp.Function:
     return at
 
 
-number_at, vector_at, response_at, turn_at = map(_at, (float, wp.vec3, wp.vec4, wp.quat))
+number_at, vector_at, response_at, turn_at = map(_make_attach, (float, wp.vec3, wp.vec4, wp.quat))
 
 
 @wp.func
@@ -196,7 +196,7 @@ class Layers:
         """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are
         flying, shape (E,).
         """
-        rows = _picked(flying)
+        rows = _select_rows(flying)
         self.action[k, rows] = self._decide(obs[rows])
         return self.action[k]
 
@@ -204,7 +204,7 @@ class Layers:
         """Turn derivatives by the actions of step k into those by its observations, of the flights
         that flew it, shape (E,).
         """
-        rows = _picked(flown)
+        rows = _select_rows(flown)
         with torch.enable_grad():
             observation = self._obs[k, rows].detach().requires_grad_()
             action = self._decide(observation)
@@ -216,7 +216,7 @@ class Layers:
         """Give the weights their derivatives from the steps that were flown, bool, shape (T, E);
         flights count by shares, shape (E,).
         """
-        rows = _picked(flown.flatten())
+        rows = _select_rows(flown.flatten())
         obs, by_action = (
             tensor[: len(flown)].flatten(0, 1)[rows]
             for tensor in (self._obs, self.by_action * shares[:, None])
@@ -228,7 +228,7 @@ class Layers:
             weight.grad = gradient
 
 
-def _picked(mask: Tensor) -> Tensor | slice:
+def _select_rows(mask: Tensor) -> Tensor | slice:
     """Rows where a mask, shape (N,), is not 0; all of them where that is so, and on a GPU, which
     would have to wait to know.
     """

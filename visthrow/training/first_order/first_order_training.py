@@ -22,7 +22,7 @@ from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, step
 from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit
 from visthrow.training.ppo.algorithm import Algorithm
-from visthrow.training.ppo.network import MuonAdam, Network, averaged, cosine_rate
+from visthrow.training.ppo.network import MuonAdam, Network, average_weights, cosine_rate
 from visthrow.training.ranks import Ranks
 
 # Reach of the barriers
@@ -109,10 +109,10 @@ class FirstOrder(Algorithm):
             last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
-        self.average = averaged(self.network, AVERAGED)
+        self.average = average_weights(self.network, AVERAGED)
         self._requests = torch.zeros_like(self.flights.steps)
         self.layers = Layers(self.network, self.flights.obs)
-        self._launches = self._recorded()
+        self._launches = self._record_launches()
         self.iterations = self.p.iterations
         self._adapting = False
         self._schedule(0.0)
@@ -183,7 +183,7 @@ class FirstOrder(Algorithm):
         )
         miss = landing - self.env.views.goal_w[:, :2]
         error = (miss.square().sum(-1) + ROUND**2).sqrt()
-        reward = rewards.at_release(p, error, fall, clearance, release.clearance_margin)
+        reward = rewards.release_reward(p, error, fall, clearance, release.clearance_margin)
         return reward, error, fall
 
     def _pull(self, x: SimpleNamespace) -> Tensor:
@@ -280,7 +280,7 @@ class FirstOrder(Algorithm):
         self.backward()
         return figures | {"cost": cost}
 
-    def _recorded(self) -> list[wp.Launch]:
+    def _record_launches(self) -> list[wp.Launch]:
         """Return the launches of the surrogate's way back, a step each."""
         env = self.env
         flights = self.flights

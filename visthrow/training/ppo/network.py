@@ -148,7 +148,7 @@ def cosine_rate(
     return rate
 
 
-def averaged(module: torch.nn.Module, window: int) -> AveragedModel:
+def average_weights(module: torch.nn.Module, window: int) -> AveragedModel:
     """Return the running mean of a module's weights over the last quarter of its updates,
     ``window`` of them at most.
 

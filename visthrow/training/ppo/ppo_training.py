@@ -12,7 +12,7 @@ from visthrow.common.errors import ConfigError
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.algorithm import Algorithm
-from visthrow.training.ppo.network import CapturableGaussian, Network, averaged
+from visthrow.training.ppo.network import CapturableGaussian, Network, average_weights
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
 
@@ -85,7 +85,7 @@ class PPOTraining(Algorithm):
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
         self.network = self.alg.actor
-        self.average = averaged(self.network, AVERAGED)
+        self.average = average_weights(self.network, AVERAGED)
         self._obs = self.env.get_observations()
         # a solver whose work cannot be captured is launched
         capturable = device.startswith("cuda") and self.env.sim.capturable
