@@ -267,4 +267,4 @@ def test_a_mixed_mujoco_is_named_by_plants_and_solvers(monkeypatch):
     assert caught.value.name == "mujoco.batch"
     solver = runpy.run_module("sim.solvers.mujoco")
     with raises(ModuleNotFoundError, match="another MuJoCo"):
-        solver["_on_cpu"](None, {}, 1, "cpu")
+        solver["_make_on_cpu"](None, {}, 1, "cpu")
