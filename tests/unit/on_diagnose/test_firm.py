@@ -9,7 +9,7 @@ from pytest import approx, mark
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.reporting.diagnosis_report import instead
-from visthrow.diagnose.select import held_out, result, scatter, verdicts
+from visthrow.diagnose.select import candidates, held_out, result, verdicts
 
 
 def promised(nats, came):
@@ -214,7 +214,7 @@ def test_two_causes_that_may_be_two_others_are_reported():
 
 def test_several_forms_at_once_are_another_form(monkeypatch):
     """Two effects that differ from flight to flight at once: neither is the cause."""
-    form = scatter.Scatter("", "", "", "rope", "N", (), True, 1.0, 0.5, 1.5, 0.1, 20.0, 8)
+    form = candidates.Scatter("", "", "", "rope", "N", (), True, 1.0, 0.5, 1.5, 0.1, 20.0, 8)
     forms = tuple(replace(form, name=f"effect_{i:02d}_by_flight") for i in (1, 4))
     overall = []
     for count in (1, 2):

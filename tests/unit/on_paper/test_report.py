@@ -175,7 +175,7 @@ def test_pictures_show_what_they_are_given():
 
     def drawn(scale: float) -> list[bytes]:
         size = Interval(scale, 0.9 * scale, 1.1 * scale)
-        first = figures.Line("a", [1.0, 2.0], [size, size], own=0)
+        first = figures.Line("a", [1.0, 2.0], [size, size], trained_at=0)
         other = figures.Line("b", [1.0, 2.0], [size, size], series=1)
         panels = [figures.Panel("both", "x", (first, other)), figures.Panel("none", "x", ())]
         points = scale * np.array([[1.0, 0.2], [2.0, 0.1]])
