@@ -459,3 +459,18 @@ def test_lost_commands_are_found_beside_a_cause():
     assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
     assert found.low < SHARE < found.high
     assert found.nats > 50.0
+
+
+def test_lost_commands_are_found_where_one_window_of_all_shows_them():
+    """A command that differs little from the one before is not missed: here eight windows of nine
+    show none of 6 %.
+    """
+    logs = fly(setting_with({}), seed=7, free=1, throws=2, seconds=3.0, lost=0.06)
+    model = ThrowModel(logs, paper_plant(), only=ONLY)
+    windows = model.windows({})
+    problem = Problem.of(model, windows, range(len(windows)))
+    nominal = linearise(problem, np.zeros(len(ONLY)), windows=windows)
+    found = dropped.verdict(nominal, (), 5.0)
+    assert found is not None
+    assert found.found
+    assert found.nats > 50.0

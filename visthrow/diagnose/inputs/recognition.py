@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
-from visthrow.common.rotations import matrix_of_quat, rotate_back
+from visthrow.common.rotations import matrix_of_quat, rotate_back, tilt_deg
 from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, split_unit
 from visthrow.diagnose.inputs.unit_evidence import (
     LENGTHS,
@@ -43,7 +43,6 @@ _LARGEST_THRUST = 5000.0  # in any unit: what is larger counts to 65535, as a Cr
 _TURN = 7.0  # above a full turn in radians: degrees
 _UNUSUAL = 1.0  # nats against an order or axes that are not the usual ones
 _TILTED = 10.0  # nats against an attitude that leans over, or whose mean force does
-_UPRIGHT = 0.7  # share of a flight's force that its mean has along up, at least
 _PACK = (2.5, 60.0)  # of any vehicle's battery [V]
 _FRAMES = {"w": "world", "wb": "world", "b": "body", "c": "camera"}
 """Frame of a channel by the end of its name."""
@@ -217,8 +216,7 @@ class Recognition:
             force_b = self._samples(group)
             turn = matrix_of_quat(attitudes.attitudes(force_b.time))
             force_w = turn @ (force_b.values @ turn_to(axes))[..., None]
-            middle = np.median(np.linalg.norm(force_b.values, axis=1))
-            if np.mean(force_w[:, 2]) > _UPRIGHT * middle:
+            if tilt_deg(np.mean(force_w, axis=0)[:, 0]) < physics.TURNED:
                 return False
         return bool(groups)
 

@@ -18,8 +18,9 @@ from scipy.special import betaincinv
 
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
-from visthrow.diagnose.likelihood.correlation import few_of
+from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.forms import predicted
 from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import Statistics, correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
@@ -82,6 +83,17 @@ def _evidence(
     return np.array([evidence_of(came, priors, named) for named in sets])
 
 
+def _least_explained(point: Point) -> list[int]:
+    """Return the numbers of the windows with the largest errors for their noise: one lost command
+    shows in its window alone.
+    """
+    errors = []
+    for window in point.windows:
+        innovation, expected, _ = predicted(window, point.noise, window.residual)
+        errors.append(np.mean(innovation**2 / expected))
+    return np.sort(np.argsort(errors)[-LOOKED_AT:]).tolist()
+
+
 def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | None:
     """Whether commands got lost, beside a set of effects or any that are still missing; None where
     none was, or a model cannot tell.
@@ -95,7 +107,7 @@ def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | 
     graded = priors.visible & ~problem.switches
     sets = active, np.flatnonzero(graded[: len(problem.model.effects)]).tolist()
     numbers = range(len(problem.kept))
-    for rows, shares in ((few_of(numbers), reach[::COARSE]), (numbers, reach)):
+    for rows, shares in ((_least_explained(point), reach[::COARSE]), (numbers, reach)):
         chosen = [problem.kept[w] for w in rows]
         columns = problem.model.without_commands(point.about.theta, chosen)
         if not columns:

@@ -19,6 +19,7 @@ from visthrow.logs.samples import Samples
 # to be compared
 MOVES = 0.05
 STEEPEST = 75.0  # median tilt of a flight [deg]
+TURNED = 30.0  # by which no mount is off, and forces of a flight do not point aside [deg]
 
 ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 _PREFIXES = ("", "est_", "mocap_", "payload_")
@@ -36,7 +37,6 @@ CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
-_FILTERED = 0.1  # by which filters may delay a path beside an attitude [s]
 _RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
 DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
@@ -295,7 +295,7 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
             f" {hint or 'axes are exchanged, or gravity is missing'}"
         )
         yield Row("units" if hint else "frames", channels, "bad", text, figures)
-    elif tilt > 30.0:
+    elif tilt > TURNED:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
         yield Row("frames", channels, "bad", text, figures)
     else:
@@ -337,8 +337,9 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     if relation is None:
         return
     wrong = _exchanged(relation, channels)
-    if wrong is None and sensed:
-        wrong = _exchanged_body(Samples(time, acc), attitude, force_b, channels)
+    if wrong is None and sensed and relation.delay_sd < _UNTOLD:
+        late = relation.delay
+        wrong = _turned_body(Samples(time, acc), attitude, force_b, late, channels)
     if wrong is None:
         yield from _pushed(relation, acc, pushed, channels, sensed)
     else:
@@ -395,34 +396,56 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
-def _exchanged_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
-    """Return a row where an accelerometer's x and y fit better exchanged. They feel drag and cable
-    alone; z, which feels the thrust, is left out.
+def _turned_body(
+    acc: Samples, attitude: Samples, force_b: Samples, late: float, channels: str
+) -> Row | None:
+    """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
+    feel drag and cable alone; z, which feels the thrust, is left out.
+
+    ``late``: by which attitude and accelerometer are behind the path [s].
     """
     time = acc.time
-    known = (time > force_b.time[0] + _SPAN) & (time < force_b.time[-1] - _SPAN)
+    instants = time + late
+    known = (instants > force_b.time[0] + _SPAN) & (instants < force_b.time[-1] - _SPAN)
     grid = time[known]
     if len(grid) < 50:
         return None
     level = np.array([1.0, 1.0, 0.0])
-    measured = Samples(grid, level * force_b.mean_over(grid, 2.0 * _SPAN))
-    force_w = acc.values[known] + _UP
-    found = []
-    for shift in np.arange(-_FILTERED, 1.5 * _FILTERED, _FILTERED):
-        expected = level * rotate_back(attitude.attitudes(grid + shift), force_w)
-        relation = relations.relate(Samples(grid, expected), measured, reach=_DELAY_BAD)
-        if relation is None:
-            return None
-        found.append(relation)
-    # axes that are exchanged do not correlate as they are, by no attitude that a filter delays; of
-    # a payload that swings in circles, an attitude that is late looks like a quarter turn
-    if max(relation.correlation for relation in found) > BELONGS:
+    measured = level * force_b.mean_over(grid + late, 2.0 * _SPAN)
+    expected = level * rotate_back(attitude.attitudes(grid + late), acc.values[known] + _UP)
+    relation = relations.relate(Samples(grid, expected), Samples(grid, measured), reach=_DELAY_BAD)
+    if relation is None:
         return None
-    relation = found[len(found) // 2]
-    if relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
-        return None
-    figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
-    return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
+    angle, correlation, nats = _turn_about_z(expected, measured, np.ptp(grid))
+    # axes that are exchanged do not correlate as they are
+    exchanged = relation.correlation < BELONGS and relation.axes_correlation > correlation - CLEARLY
+    if exchanged and relation.nats > _NATS and relation.axes_correlation > _CORRELATED:
+        figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
+        return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
+    if abs(angle) > TURNED and nats > _NATS and correlation > _CORRELATED:
+        text = (
+            f"acc_b fits turned by {angle:+.0f} deg about z, {nats:.0f} nats better (correlation"
+            f" {correlation:.2f}, not {relation.correlation:.2f}): mount, or attitude"
+        )
+        figures = {"turned_deg": angle, "of": "acc_b", "nats": nats}
+        return Row("frames", channels, "bad", text, figures)
+    return None
+
+
+def _turn_about_z(
+    expected: np.ndarray, measured: np.ndarray, seconds: float
+) -> tuple[float, float, float]:
+    """Return the angle about z [deg] from expected to measured vectors, shape (N, 3), their
+    correlation once it is taken back, and the nats by which that is better.
+    """
+    first, second = (v[:, 0] + 1j * v[:, 1] for v in (expected, measured))
+    first = first - np.mean(first)
+    second = second - np.mean(second)
+    cross = np.vdot(first, second) / max(np.linalg.norm(first) * np.linalg.norm(second), 1e-300)
+    turned = min(abs(cross), 0.999)
+    plain = min(max(cross.real, 0.0), 0.999)
+    nats = 0.5 * seconds / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - turned**2))
+    return np.degrees(np.angle(cross)), turned, nats
 
 
 def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
