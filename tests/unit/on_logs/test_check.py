@@ -676,7 +676,7 @@ def test_thrust_that_answers_gusts_is_on_no_other_clock(stiffness, damping, last
         (20.0, 0.0, ""),
         (50.0, 0.0, "acc_b fits turned by +50 deg about z"),
         (-50.0, 0.03, "acc_b fits turned by -50 deg about z"),
-        (90.0, 0.0, "acc_b fits as (y,-x,z)"),
+        (90.0, 0.0, "acc_b fits as (-y,x,z)"),
     ],
 )
 def test_a_turned_accelerometer_is_named(turned_deg, late, words):

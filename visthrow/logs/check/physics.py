@@ -47,6 +47,7 @@ _SHARED = 3.0  # accelerations that share their samples: as many times fewer are
 _PUSHED = 0.2
 _LONGER = 0.05  # of the model's length: markers sit off the ends
 _OTHER_CABLE = 0.25  # likewise: another cable
+_COMPARED = 4000  # samples of an accelerometer that are compared at each delay
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
@@ -337,9 +338,8 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     if relation is None:
         return
     wrong = _exchanged(relation, channels)
-    if wrong is None and sensed and relation.delay_sd < _UNTOLD:
-        late = relation.delay
-        wrong = _turned_body(Samples(time, acc), attitude, force_b, late, channels)
+    if wrong is None and sensed:
+        wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is None:
         yield from _pushed(relation, acc, pushed, channels, sensed)
     else:
@@ -396,56 +396,60 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
-def _turned_body(
-    acc: Samples, attitude: Samples, force_b: Samples, late: float, channels: str
-) -> Row | None:
+def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
     """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
     feel drag and cable alone; z, which feels the thrust, is left out.
-
-    ``late``: by which attitude and accelerometer are behind the path [s].
     """
-    time = acc.time
-    instants = time + late
-    known = (instants > force_b.time[0] + _SPAN) & (instants < force_b.time[-1] - _SPAN)
-    grid = time[known]
-    if len(grid) < 50:
+    span = np.ptp(acc.time)
+    first = force_b.time[0] + _SPAN + relations.REACH
+    last = force_b.time[-1] - _SPAN - relations.REACH
+    known = np.flatnonzero((acc.time > first) & (acc.time < last))
+    known = known[:: 1 + len(known) // _COMPARED]
+    if len(known) < 50:
         return None
+    grid = acc.time[known]
+    force_w = acc.values[known] + _UP
     level = np.array([1.0, 1.0, 0.0])
-    measured = level * force_b.mean_over(grid + late, 2.0 * _SPAN)
-    expected = level * rotate_back(attitude.attitudes(grid + late), acc.values[known] + _UP)
-    relation = relations.relate(Samples(grid, expected), Samples(grid, measured), reach=_DELAY_BAD)
-    if relation is None:
+    plain = mirrored = 0.0
+    turned = 0.0j
+    # attitude and accelerometer of one clock may be late beside the path
+    for late in np.arange(-relations.REACH, relations.REACH + _DELAY_WARN, _DELAY_WARN):
+        expected = level * rotate_back(attitude.attitudes(grid + late), force_w)
+        measured = level * force_b.mean_over(grid + late, 2.0 * _SPAN)
+        kept, flipped = _level_correlations(expected, measured)
+        plain = max(plain, kept.real)
+        if max(abs(kept), abs(flipped)) > max(abs(turned), mirrored):
+            turned, mirrored = kept, abs(flipped)
+            best = Samples(grid, expected), Samples(grid, measured)
+    relation = relations.relate(*best, reach=_DELAY_BAD)
+    correlation = min(max(abs(turned), mirrored), 0.999)
+    nats = 0.5 * span / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - correlation**2))
+    surely = nats > _NATS and correlation > max(_CORRELATED, plain + CLEARLY)
+    if relation is None or not surely:
         return None
-    angle, correlation, nats = _turn_about_z(expected, measured, np.ptp(grid))
-    # axes that are exchanged do not correlate as they are
-    exchanged = relation.correlation < BELONGS and relation.axes_correlation > correlation - CLEARLY
-    if exchanged and relation.nats > _NATS and relation.axes_correlation > _CORRELATED:
+    angle = np.degrees(np.angle(turned))
+    quarters = abs(angle - 90.0 * round(angle / 90.0))
+    if mirrored > abs(turned) or (abs(angle) > TURNED and quarters < 0.5 * TURNED):
         figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
         return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
-    if abs(angle) > TURNED and nats > _NATS and correlation > _CORRELATED:
-        text = (
-            f"acc_b fits turned by {angle:+.0f} deg about z, {nats:.0f} nats better (correlation"
-            f" {correlation:.2f}, not {relation.correlation:.2f}): mount, or attitude"
-        )
-        figures = {"turned_deg": angle, "of": "acc_b", "nats": nats}
-        return Row("frames", channels, "bad", text, figures)
-    return None
+    if abs(angle) < TURNED:
+        return None
+    text = (
+        f"acc_b fits turned by {angle:+.0f} deg about z, {nats:.0f} nats better (correlation"
+        f" {correlation:.2f}, not {plain:.2f}): its mount, or axes of the attitude"
+    )
+    return Row("frames", channels, "bad", text, {"turned_deg": angle, "of": "acc_b", "nats": nats})
 
 
-def _turn_about_z(
-    expected: np.ndarray, measured: np.ndarray, seconds: float
-) -> tuple[float, float, float]:
-    """Return the angle about z [deg] from expected to measured vectors, shape (N, 3), their
-    correlation once it is taken back, and the nats by which that is better.
+def _level_correlations(first: np.ndarray, second: np.ndarray) -> tuple[complex, complex]:
+    """Return correlations of vectors, shape (N, 3), in x and y: their angles are those by which the
+    second are turned beside the first, and beside the first's mirror image.
     """
-    first, second = (v[:, 0] + 1j * v[:, 1] for v in (expected, measured))
-    first = first - np.mean(first)
-    second = second - np.mean(second)
-    cross = np.vdot(first, second) / max(np.linalg.norm(first) * np.linalg.norm(second), 1e-300)
-    turned = min(abs(cross), 0.999)
-    plain = min(max(cross.real, 0.0), 0.999)
-    nats = 0.5 * seconds / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - turned**2))
-    return np.degrees(np.angle(cross)), turned, nats
+    a, b = (v[:, 0] + 1j * v[:, 1] for v in (first, second))
+    a = a - np.mean(a)
+    b = b - np.mean(b)
+    power = max(np.linalg.norm(a) * np.linalg.norm(b), 1e-300)
+    return complex(np.vdot(a, b) / power), complex(np.vdot(np.conj(a), b) / power)
 
 
 def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
