@@ -20,13 +20,14 @@ from tests.plants import paper_plant
 from tests.synthetic_diagnosis import explain_without_laws
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.evidence import STRONG, Priors
 from visthrow.diagnose.models.model_interface import Linearised
 from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
+from visthrow.diagnose.select.selection import Selector
 from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -474,3 +475,17 @@ def test_lost_commands_are_found_where_one_window_of_all_shows_them():
     assert found is not None
     assert found.found
     assert found.nats > 50.0
+
+
+def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():
+    """By a part of what the wind is worth, for both push steadily; a shifted mass does not."""
+    logs = fly(setting_with({"wind_x": 0.3}), seed=3, free=1, throws=0, seconds=2.6)
+    names = ["wind_x", "frame_tilt_y", "com_x"]
+    model = ThrowModel(logs, paper_plant(), only=names)
+    windows = model.windows({})
+    problem = Problem.of(model, windows, range(len(windows)))
+    selector = Selector(linearise(problem, np.zeros(len(names))), 5.0, laws=False)
+    named = {c.name: frozenset({c}) for c in selector.candidates}
+    selector.best = selector._tried(selector.nominal, [named["wind_x"]])[0]
+    assert selector._limit(named["frame_tilt_y"]) > 2.0 * STRONG
+    assert selector._limit(named["com_x"]) == STRONG
