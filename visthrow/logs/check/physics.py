@@ -401,8 +401,9 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     feel drag and cable alone; z, which feels the thrust, is left out.
     """
     span = np.ptp(acc.time)
-    first = force_b.time[0] + _SPAN + relations.REACH
-    last = force_b.time[-1] - _SPAN - relations.REACH
+    reach = 2.0 * _DELAY_BAD  # half of that refuses a log
+    first = force_b.time[0] + _SPAN + reach
+    last = force_b.time[-1] - _SPAN - reach
     known = np.flatnonzero((acc.time > first) & (acc.time < last))
     known = known[:: 1 + len(known) // _COMPARED]
     if len(known) < 50:
@@ -413,7 +414,7 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     plain = mirrored = 0.0
     turned = 0.0j
     # attitude and accelerometer of one clock may be late beside the path
-    for late in np.arange(-relations.REACH, relations.REACH + _DELAY_WARN, _DELAY_WARN):
+    for late in np.arange(-reach, reach + 0.5 * _DELAY_WARN, _DELAY_WARN):
         expected = level * rotate_back(attitude.attitudes(grid + late), force_w)
         measured = level * force_b.mean_over(grid + late, 2.0 * _SPAN)
         kept, flipped = _level_correlations(expected, measured)
