@@ -152,7 +152,7 @@ class HybridMotorPlant(HybridWirePlant):
         self.quat_wb = self._now["quat_wb"]
         self.rate_b = self._now["rate_b"]
 
-    def _built(self, experiment: Experiment) -> HybridPlant:
+    def _build(self, experiment: Experiment) -> HybridPlant:
         # the firmware's own path comes in the delay's place
         values = {"vehicle.queue.delay": 0.0, "release.lag": MECHANISM}
         return HybridPlant(self._fine(changed(experiment, values)), motors=True)

@@ -283,7 +283,7 @@ class Controllers(Pilots):
         )
         span = self.delays.measurement + self.delays.command
         state = look_ahead(
-            self.plan.model, self._estimate(snapshot, sent, span), sent, self.period, span
+            self.plan.model, self._correct_estimate(snapshot, sent, span), sent, self.period, span
         )
         reference = (self._reference[0][k : k + n + 1], self._reference[1][k : k + n])
         for e in np.flatnonzero(flight.flown):
@@ -297,7 +297,7 @@ class Controllers(Pilots):
             command, np.full(len(command), k >= self.latch), _normalise(self.params, command)
         )
 
-    def _estimate(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
+    def _correct_estimate(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
         """State now: the model's prediction from the period before, corrected by what
         is measured.
         """
