@@ -219,6 +219,21 @@ def without_effects(gram: Gram) -> Gram:
     return replace(gram, inner=inner, cross=gram.cross[:, : gram.hidden])
 
 
+def in_one_channel(gram: Gram, scale: ndarray) -> Gram:
+    """Return a Gram matrix whose samples are all of one channel with the noise that they state.
+
+    ``scale``: of each channel's sigma, shape (C,)."""
+    weight = scale**-2.0
+    return replace(
+        gram,
+        count=np.array([gram.count.sum()]),
+        inner=np.tensordot(weight, gram.inner, 1)[None],
+        cross=(weight @ gram.cross)[None],
+        square=np.array([weight @ gram.square]),
+        log_sigma=gram.log_sigma + float(gram.count @ np.log(scale)),
+    )
+
+
 def with_latent_effects(gram: Gram) -> Gram:
     """Return a Gram matrix whose unit latents are effects as well, behind the others."""
     columns = np.r_[: len(gram.cross[0]), gram.nuisances : gram.hidden]
@@ -380,5 +395,5 @@ def without_rounding(information: ndarray, grams: Sequence[Gram]) -> ndarray:
     if lowest < 0.0:
         # rounding, which wide priors of several named effects would turn into evidence; what says
         # nothing of an effect stays silent
-        information -= 2.0 * lowest * information * np.eye(size)
+        np.einsum("wii->wi", information)[:] *= 1.0 - 2.0 * lowest
     return information

@@ -16,6 +16,7 @@ from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names, Scatter
 from visthrow.diagnose.select.point import (
     ROUNDS,
+    SMALL_STEP,
     Point,
     Problem,
     linearise,
@@ -183,8 +184,12 @@ def _not_followed(selection: Selector) -> list[int]:
     """
     point = selection.best.point
     goal = point.posterior.estimate(selection.best.columns)
-    leads = moved(point, np.where(point.problem.switches, point.theta, goal))
-    return untracked_windows(point) or (untracked_windows(leads) if leads else [])
+    theta = np.where(point.problem.switches, point.theta, goal)
+    untracked = untracked_windows(point)
+    if untracked or np.abs(theta - point.theta).max() <= SMALL_STEP:
+        return untracked
+    leads = moved(point, theta)
+    return untracked_windows(leads) if leads else []
 
 
 def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:

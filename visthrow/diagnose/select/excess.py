@@ -7,6 +7,7 @@ stronger in throws than in the quietest phase is no gust but something that the 
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy import ndarray
@@ -15,7 +16,8 @@ from visthrow.diagnose.likelihood.evidence import NORMAL_95, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.integrals import fitted
 from visthrow.diagnose.likelihood.marginal import Gram, Noise
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
+from visthrow.diagnose.likelihood.threads import parallel_map
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Level
 
@@ -68,18 +70,28 @@ def floors_of(point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
     within the median window.
     """
-    positions = positions_of(point)
-    moves = {}
-    for gram, window in zip(point.grams, point.windows):
-        rows = np.isin(window.channel, positions)
-        if not rows.any():
-            continue
-        for block in np.unique(gram.latent_block).tolist():
-            reach = window.latent[rows] @ gram.factor[:, gram.latent_block == block]
-            distance = float(np.sqrt((reach**2).sum(1).max()))
+    moves: dict[tuple[int, str], list[float]] = {}
+    reaches = parallel_map(partial(_reaches, positions_of(point)), point.grams, point.windows)
+    for gram, reach in zip(point.grams, reaches):
+        for block, distance in reach.items():
             moves.setdefault((block, gram.phase), []).append(distance)
     medians = {key: float(np.median(distances)) for key, distances in moves.items()}
     return {key: LANDING / median for key, median in medians.items() if median > 0.0}
+
+
+def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, float]:
+    """Return how far unit latents of each block move a position within a window [m]; nothing where
+    none was measured.
+    """
+    rows = np.isin(window.channel, positions)
+    if not rows.any():
+        return {}
+    square = (window.latent[rows] @ gram.factor) ** 2
+    reaches = {}
+    for block in np.unique(gram.latent_block).tolist():
+        of_block = square @ (gram.latent_block == block)
+        reaches[block] = float(np.sqrt(of_block.max()))
+    return reaches
 
 
 def positions_of(point: Point) -> list[int]:

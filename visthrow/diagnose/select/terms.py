@@ -22,6 +22,7 @@ from visthrow.diagnose.likelihood.marginal import (
     Statistics,
     correlated_of,
     grams_of,
+    in_one_channel,
     with_latent_effects,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
@@ -109,8 +110,10 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
-    extended = parallel_map(with_latent_effects, grams)
-    parts = Integrals(extended, noise).statistics(extended, point.theta)
+    weighed = parallel_map(partial(in_one_channel, scale=noise.scale), grams)
+    extended = parallel_map(with_latent_effects, weighed)
+    unscaled = replace(noise, scale=np.ones(1))
+    parts = Integrals(extended, unscaled).statistics(extended, point.theta)
     plain = parts.first(len(point.theta)).by(parts.flights)
     return replace(point, noise=noise, grams=grams, plain=plain, shares={}), parts
 
