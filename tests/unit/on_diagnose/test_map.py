@@ -440,3 +440,80 @@ def test_an_attitude_that_comes_too_seldom_is_refused_by_its_period():
     log = FlightLog(whole.channels | {"quat_wb": attitude}, {"source": "a.ulg"})
     with raises(DiagnoseError, match="the attitude comes every 60 ms"):
         record_of(log)
+
+
+def flown_by_motors(columns: dict[str, np.ndarray], motors: np.ndarray, name: str) -> dict:
+    """Table of a flight whose four motors have the same numbers."""
+    table = {"time": columns["time"]} | named("pos", columns["pos_w"])
+    table |= {f"q{a}": c for a, c in zip("xyzw", columns["quat_wb"].T)}
+    return table | {f"{name}{i}": motors for i in range(1, 5)}
+
+
+@pytest.mark.parametrize(
+    ("name", "counts", "tau"),
+    [("rpm", lambda share: 9000.0 * np.sqrt(share), 0.0), ("pwm", None, 0.03)],
+)
+def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
+    """By the speeds of the rotors, which have no lag; by pulses, which begin at 1000 us."""
+    columns = flight(20.0)
+    share = columns["command"][:, 0] / np.max(columns["command"][:, 0])
+    motors = counts(share) if counts is not None else 1000.0 + 900.0 * share
+    table = flown_by_motors(columns, motors, name)
+    found = propose(table, "a.csv", mass=0.2)
+    (log,) = logs_of(table, found.mapping, "a.csv")
+    inputs = log[found.flyer["input"]].values
+    thrust = np.polynomial.polynomial.polyval(inputs, found.flyer["thrust_map"]).sum(axis=1)
+    assert np.median(thrust) == approx(0.2 * 9.81, rel=0.1)
+    assert thrust / np.median(thrust) == approx(share / np.median(share), rel=1e-3)
+    assert found.flyer["motor_time_constant"] == tau
+
+
+def test_outputs_without_a_motor_are_left_out_and_what_drives_a_flap_is_asked_about():
+    columns = flight(20.0)
+    outputs = np.tile(1000.0 + 400.0 * columns["command"][:, :1] / 2.0, (1, 6))
+    outputs[:, 4:] = 900.0
+    table = {"time": columns["time"]} | named("pos", columns["pos_w"])
+    table |= {f"actuator_outputs[{i}]": c for i, c in enumerate(outputs.T)}
+    entry = propose(table, "a.csv").mapping.entry("motor_command")
+    assert entry.columns == tuple(f"actuator_outputs[{i}]" for i in range(4))
+    for i in (4, 5):
+        table[f"actuator_outputs[{i}]"] = 1500.0 + 100.0 * np.sin(i * columns["time"])
+    found = propose(table, "a.csv")
+    assert found.mapping.entry("motor_command") is None
+    assert any("which four of actuator_outputs[0]" in question for question in found.questions)
+
+
+def test_a_component_may_stand_before_its_word():
+    columns = flight(20.0)
+    angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, ::-1]
+    table = {"time": columns["time"]}
+    table |= {f"{a}_estimate": c for a, c in zip("xyz", columns["pos_w"].T)}
+    table |= {f"{a}_estimate": c for a, c in zip(("roll", "pitch", "yaw"), angles.T)}
+    table |= {f"{a}_velocity": c for a, c in zip("xyz", columns["vel_w"].T)}
+    rates = np.degrees(columns["rate_b"])
+    table |= {f"{a}_rate_dps": c for a, c in zip(("roll", "pitch", "yaw"), rates.T)}
+    table |= {f"{a}_sp": c + 0.1 for a, c in zip("xyz", columns["pos_w"].T)}
+    found = propose(table, "a.csv")
+    units = {"quat_wb": "rad", "pos_w": "m", "vel_w": "m/s", "rate_b": "deg/s"}
+    assert units_of(found) == units
+    assert not found.questions
+    assert found.left_out == ["x_sp", "y_sp", "z_sp"]
+
+
+def test_a_flag_is_no_number_of_a_flight():
+    columns = flight(20.0)
+    table = {"time": columns["time"]} | named("pos", columns["pos_w"])
+    half = np.arange(len(columns["time"])) % 7 == 0
+    table |= {"data_valid": half.astype(float), "tracking_valid": half.astype(float)}
+    assert not any("[table.split]" in question for question in propose(table, "a.csv").questions)
+    found = propose(table | {"flight_id": half.astype(float)}, "a.csv")
+    assert any("'flight_id' has 2 values" in question for question in found.questions)
+
+
+def test_a_thrust_in_shares_of_the_full_one_is_doubted():
+    """Kilograms of thrust fit it to 20 %."""
+    columns = flight(20.0)
+    table = flown_by_motors(columns, 0.7 + 0.0 * columns["time"], "motor")
+    table["hover_thrust"] = 0.32 * columns["command"][:, 0]
+    found = propose(table, "a.csv", mass=0.9)
+    assert any("or a share of the full thrust?" in question for question in found.questions)

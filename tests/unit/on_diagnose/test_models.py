@@ -401,6 +401,16 @@ class TestFlyer:
         model = FlyerModel([with_channels(log, acc_b=force)], FLYER)
         assert np.all(np.isfinite(np.concatenate(model.residuals({"estimator_lean": 1.0}))))
 
+    def test_a_log_without_a_window_is_told_how_low_it_is(self):
+        log = fly(3.0)
+        low = log["pos_w"].values - [0.0, 0.0, np.max(log["pos_w"].values[:, 2]) - 0.1]
+        sunk = with_channels(log, pos_w=Channel(log["pos_w"].time, low, "m"))
+        with raises(LogError, match=r"pos_w rises to 0\.1 m, windows are above lowest = 0\.\d+ m"):
+            FlyerModel([sunk], FLYER)
+        weak = replace(FLYER, thrust_map=tuple(1e-3 * c for c in FLYER.thrust_map))
+        with raises(LogError, match=r"carries up to 0\.00\d+ of the weight, windows at least 0\.3"):
+            FlyerModel([log], weak)
+
     def test_missing_channels_are_named(self):
         log = fly(3.0)
         del log.channels["quat_wb"]

@@ -613,6 +613,22 @@ def test_a_thrust_that_carries_more_than_the_model_weighs_hints_at_a_load(mass, 
     assert ("hangs below" in row.text) == hangs
 
 
+@mark.parametrize(("times", "verdict"), [(1.0, "ok"), (0.01, "bad"), (45.0, "bad")])
+def test_a_map_that_carries_no_vehicle_is_found_by_the_path(times, verdict):
+    """Without an accelerometer, across two jumps of the capture."""
+    columns = flight(20.0)
+    columns["pos_w"][700:720] += [0.0, 0.0, 0.4]
+    speeds = np.tile(500.0 * np.sqrt(columns["command"][:, :1]), 4)
+    log = log_of(columns, motor_speed=Channel(columns["time"], speeds, "rad/s"))
+    for name in ("acc_b", "vel_w"):
+        del log.channels[name]
+    vehicle = KnownVehicle(mass=0.2, thrust_input="motor_speed", thrust_map=(0.0, 0.0, times / 1e6))
+    rows = [row for row in thrust_checks.look(log, vehicle) if "path" in row.channel]
+    (row,) = [row for row in rows if row.topic in ("thrust", "units")]
+    assert row.verdict == verdict
+    assert row.figures["mass_kg"] == approx(0.2 * times, rel=0.05)
+
+
 @mark.parametrize(("count", "judged"), [(20, False), (60, True)])
 def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
     time = np.arange(0.0, 2.0, 0.02)

@@ -73,8 +73,17 @@ def groups_of(numbers: Table) -> list[Group]:
             unit = unit or NAMES["units"].get((part[3] or "").lower(), "")
             stem = part[1] + NAMES["families"].get(ending, "")
             families[2, stem, "", unit].setdefault(NAMES["components"][ending], name)
+        if part := PATTERNS["leading_component"].match(base):
+            letter = part[1].lower()
+            stem = _stem_behind(letter, part[2])
+            behind = unit or _last_unit(part[2])
+            families[3, stem, "", behind].setdefault(NAMES["components"][letter], name)
     listed = []
     for (_, stem, _, unit), places in sorted(families.items(), key=lambda item: item[0][0]):
+        if stem == "motor" and len(places) > 4:  # outputs without a motor stand
+            places = {
+                place: name for place, name in places.items() if moves(numbers[name][:, None])
+            }
         for whole in WHOLE:
             if places.keys() == set(whole):
                 listed.append((stem, unit, [places[place] for place in whole]))
@@ -88,6 +97,27 @@ def groups_of(numbers: Table) -> list[Group]:
             groups.append(Group(stem, tuple(names), values, unit))
             used.update(names)
     return groups
+
+
+def _stem_behind(letter: str, words: str) -> str:
+    """Return the stem of a name that begins with a component: what its words hint at, or else what
+    the component is of.
+    """
+    stem = f"{words}_"
+    hinted = {kind for kind, pattern in HINTS.items() if pattern.search(stem)} - {"position"}
+    return stem if hinted else stem + NAMES["families"].get(letter, "")
+
+
+def _last_unit(words: str) -> str:
+    """Return the unit that the last of several words is, "" where it is none."""
+    *before, last = re.split(r"[._ ]+", words.lower())
+    return NAMES["units"].get(last, "") if before else ""
+
+
+def moves(values: np.ndarray) -> bool:
+    """Tell whether rows of numbers, shape (T, columns), differ."""
+    whole = values[np.all(np.isfinite(values), axis=1)]
+    return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
 
 
 def _neighbours(numbers: Table) -> list[list[str]]:

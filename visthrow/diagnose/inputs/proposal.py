@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from visthrow.common.errors import LogError
-from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, unit_by_name
-from visthrow.diagnose.inputs.recognition import Recognition, moves, rises
+from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, moves, unit_by_name
+from visthrow.diagnose.inputs.recognition import Recognition, rises
 from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, by_mass
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
@@ -232,7 +232,13 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     proposal.why[entry.name] += f"; {unit} by the mass: it carries {masses[unit]:.4g} kg"
     if unit != entry.unit:
         proposal.mapping = proposal.mapping.with_entry(replace(entry, unit=unit))
-    if np.log(masses[unit] / weighed) > thrust_checks.MASS_WARN and "payload_pos_w" not in log:
+    off = np.log(masses[unit] / weighed)
+    if off < -thrust_checks.MASS_WARN:
+        proposal.questions.append(
+            f"{thrust} carries {masses[unit]:.4g} kg in {unit}, and the vehicle weighs {weighed:g}"
+            " kg: of another battery, or a share of the full thrust?"
+        )
+    if off > thrust_checks.MASS_WARN and "payload_pos_w" not in log:
         proposal.questions.append(
             f"{thrust} carries {masses[unit]:.4g} kg, and the vehicle weighs {weighed:g} kg: does a"
             " load hang below? The model has none; map its position as payload_pos_w and add"
@@ -264,13 +270,16 @@ def _driving(log: FlightLog, proposal: MappingProposal) -> str:
     """The input that the force follows best, "" where that cannot be determined."""
     inputs = [name for name in thrust_checks.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust_checks.follows(log, name)) is not None}
-    if len(inputs) < 2 or not scores:
+    if len(inputs) < 2:
+        return ""
+    question = f"which of {', '.join(inputs)} drives the vehicle?"
+    if not scores:
+        proposal.questions.append(f"{question} The force says nothing; '{inputs[0]}' is taken")
         return ""
     best = max(scores, key=scores.__getitem__)
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
     proposal.questions.append(
-        f"which of {', '.join(inputs)} drives the vehicle? The force follows '{best}' best"
-        f" (correlations: {listed})"
+        f"{question} The force follows '{best}' best (correlations: {listed})"
     )
     return best
 
@@ -307,7 +316,8 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         proposal.questions.append(f"what does the payload weigh? {hanging:.3g} kg is a guess")
     newtons = mass is not None and name in ("command", "thrust_command")
     first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
-    power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
+    measured = name == "motor_speed"  # what the rotors do, behind their lag
+    power = [0.0, 0.0, first] if measured else [0.0, first, 0.0]
     volts = log["battery_voltage"].values if "battery_voltage" in log else [1.0]
     flyer = {
         "input": name,
@@ -320,6 +330,8 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         "drag_xy": float(f"{_DRAG * whole * share:.2g}"),
         **NAMES["flyer"],
     }
+    if measured:
+        flyer["motor_time_constant"] = 0.0
     if length:
         flyer["cable"] = {"length": round(length, 4), "mass": round(hanging, 5)}
     return flyer

@@ -8,7 +8,7 @@ import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.common.rotations import matrix_of_quat, rotate_back, tilt_deg
-from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, split_unit
+from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, moves, split_unit
 from visthrow.diagnose.inputs.unit_evidence import (
     LENGTHS,
     SURE,
@@ -20,6 +20,7 @@ from visthrow.diagnose.inputs.unit_evidence import (
     turn_to,
 )
 from visthrow.logs.check import physics, relations
+from visthrow.logs.check.thrust_checks import IDLE_PULSE
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
@@ -32,6 +33,9 @@ NED = "x,-y,-z"
 """Our axes in those of an autopilot: north, east, down; and forward, right, down of its body."""
 _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
 """Unit of commands of motors by what they exceed."""
+# of motors' pulses: commands from 0 up, such as DShot's, begin below them [us]
+_LEAST_PULSE = 800.0
+_LARGEST_PULSE = 2300.0
 # Of a path's derivative with what may be it: correlations that settle it, and that suggest it,
 _FIRMLY = 0.8
 _BELONGS = 0.6
@@ -64,12 +68,6 @@ class Path:
         if self.group.matches("estimate"):
             return "est_pos_w"
         return "mocap_pos_w" if self.group.matches("capture") else "pos_w"
-
-
-def moves(values: np.ndarray) -> bool:
-    """Tell whether rows of numbers, shape (T, columns), differ."""
-    whole = values[np.all(np.isfinite(values), axis=1)]
-    return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
 
 
 def rises(cells: np.ndarray) -> bool:
@@ -479,7 +477,14 @@ class Recognition:
                 )
                 continue
             unit = next(unit for above, unit in _MOTOR_UNITS if high > above)
-            if self._take("motor_command", group, unit, f"four motors up to {high:.5g}"):
+            why = f"four motors up to {high:.5g}"
+            offset = 0.0
+            turning = group.values[group.values > 0.0]
+            pulses = high < _LARGEST_PULSE and len(turning) > 0
+            if pulses and np.percentile(turning, 1) > _LEAST_PULSE:
+                why += f": pulses in us, {IDLE_PULSE:.0f} for a motor that stands"
+                offset = -IDLE_PULSE
+            if self._take("motor_command", group, unit, why, offset=offset):
                 self.questions.append(
                     f"motors {group.listed}: order them {order} (Crazyflie: 4, 1, 3, 2; Betaflight:"
                     " 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are they commands, or speeds?"
@@ -516,6 +521,12 @@ class Recognition:
 
     def _ask_what_is_open(self) -> None:
         known = self._entries.keys()
+        columns = [column for group in self._groups for column in group.columns]
+        outputs = [c for c in columns if PATTERNS["motor"].match(split_unit(c)[0])]
+        if len(outputs) > 4 and not known & {"motor_command", "motor_speed"}:
+            self.questions.append(
+                f"which four of {', '.join(outputs)} are the motors? None is taken"
+            )
         if "quat_wb" in known and not known & {"pos_w", "rate_b"}:
             group = self._sources["quat_wb"]
             if self._entries["quat_wb"].kind == "euler" and not group.unit:

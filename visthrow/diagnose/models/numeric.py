@@ -90,9 +90,10 @@ class NumericModel(Model, ABC):
         self.params = params
         self.stretches = self.cut(logs)
         if not self.stretches:
+            full = [log for log in logs if all(_holds(log, name) for name in self.needed)]
             raise LogError(
                 f"no stretch of these logs shows {', '.join(self.channels)} in a way that this"
-                " model explains"
+                f" model explains{self.without_windows(full)}"
             )
         driving = set(self.inputs) - set(self.channels)
         effects = []
@@ -131,6 +132,10 @@ class NumericModel(Model, ABC):
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """Cut one log, the flight of a number, into windows."""
         raise NotImplementedError
+
+    def without_windows(self, logs: Sequence[FlightLog]) -> str:
+        """Say what of logs that hold no window is unlike a flight."""
+        return ""
 
     def lay_out(
         self,

@@ -104,14 +104,23 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     """Return the mass that the thrust carries by the accelerometer, in flight [kg]; None where the
     log does not tell.
     """
-    thrust_signal = thrust_of(log, vehicle)
     force_b = log.samples("acc_b")
-    if thrust_signal is None or force_b is None:
+    if force_b is None:
+        return None
+    return _mass_by(log, vehicle, Samples(force_b.time, force_b.values[:, 2:3]))
+
+
+def _mass_by(log: FlightLog, vehicle: KnownVehicle, force_z: Samples | None) -> float | None:
+    """Return the mass that the thrust carries by a specific force along body z, shape (N, 1), in
+    flight [kg]; None where the log does not tell.
+    """
+    thrust_signal = thrust_of(log, vehicle)
+    if thrust_signal is None or force_z is None:
         return None
     name, (time, thrust) = thrust_signal
     if vehicle.thrust_map is None and name not in ("command", "thrust_command"):
         return None  # not in newtons
-    acc = force_b.at(time)[:, 2]
+    acc = force_z.at(time)[:, 0]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
     carries = hangs(log, time)
     if np.any(flies & carries):  # without its payload it is another mass
@@ -147,8 +156,12 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         return
     name, command = thrust
     mass = mass_of(log, vehicle)
+    measurement = "acc_b"
+    if mass is None:
+        mass = _mass_by(log, vehicle, _along_path(log))
+        measurement = "path"
     if mass is not None:
-        yield _weight(mass, vehicle, f"{name}, acc_b")
+        yield _weight(mass, vehicle, f"{name}, {measurement}")
     if sparse(command.time):
         period = 1e3 * np.median(np.diff(command.time))
         text = f"comes every {period:.0f} ms: too seldom to be held against the force"
@@ -219,6 +232,14 @@ def _along_z(log: FlightLog, measurement: str) -> Samples | None:
         return None
     turn = attitude.attitudes(time)
     return Samples(time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3])
+
+
+def _along_path(log: FlightLog) -> Samples | None:
+    """Return the specific force along body z by the path, without what its jumps make of it."""
+    force_z = _along_z(log, "path")
+    if force_z is None:
+        return None
+    return Samples(force_z.time, _trimmed(force_z.values.T).T)
 
 
 def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.ndarray, float]]:

@@ -22,6 +22,7 @@ from visthrow.diagnose.models.quadrotor.flyer_plant import replay_of
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
     NEIGHBOUR,
     ROWS,
+    say_what_is_low,
     spare,
     windows_of,
     without_each,
@@ -55,6 +56,10 @@ class FlyerModel(DrivenModel):
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
         return windows_of(self, log, number)
+
+    def without_windows(self, logs: Sequence[FlightLog]) -> str:
+        """See the base class."""
+        return say_what_is_low(logs, self.params)
 
     def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; samples in the order of the replay's sensors."""

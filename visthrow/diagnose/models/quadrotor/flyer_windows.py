@@ -106,6 +106,25 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
     return stretches
 
 
+def say_what_is_low(logs: Sequence[FlightLog], params: FlyerParams) -> str:
+    """Say how high logs fly and how much of the weight their thrust carries, beside what windows
+    need.
+    """
+    heights = [np.max(log[params.position].samples().values[:, 2]) for log in logs]
+    weight = params.gravity * params.total_mass
+    shares = []
+    for log in logs:
+        sent = log[params.input].samples().values
+        thrusts = params.thrust(sent[:, :1] if params.input == "command" else sent)
+        shares.append(np.max(thrusts.sum(axis=1)) / weight)
+    return (
+        f": {params.position} rises to {max(heights):.3g} m, windows are above lowest ="
+        f" {params.lowest:g} m; the thrust by {params.input} and thrust_map carries up to"
+        f" {max(shares):.3g} of the weight, windows at least {_IDLE:g}; no channel may have a gap"
+        f" of {_MOST_MISSING:g} s"
+    )
+
+
 def covered(channel: Channel, start: float, end: float) -> bool:
     """Whether a channel has no large gap between two times."""
     during = (channel.time >= start) & (channel.time <= end)
