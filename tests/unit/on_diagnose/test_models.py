@@ -401,10 +401,10 @@ class TestFlyer:
         model = FlyerModel([with_channels(log, acc_b=force)], FLYER)
         assert np.all(np.isfinite(np.concatenate(model.residuals({"estimator_lean": 1.0}))))
 
-    def test_a_log_without_a_window_is_told_how_low_it_is(self):
+    def test_a_log_without_a_window_is_refused_by_height_and_thrust(self):
         log = fly(3.0)
         low = log["pos_w"].values - [0.0, 0.0, np.max(log["pos_w"].values[:, 2]) - 0.1]
-        sunk = with_channels(log, pos_w=Channel(log["pos_w"].time, low, "m"))
+        sunk = with_channels(log, pos_w=replace(log["pos_w"], values=low))
         with raises(LogError, match=r"pos_w rises to 0\.1 m, windows are above lowest = 0\.\d+ m"):
             FlyerModel([sunk], FLYER)
         weak = replace(FLYER, thrust_map=tuple(1e-3 * c for c in FLYER.thrust_map))

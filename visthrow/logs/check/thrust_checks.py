@@ -157,7 +157,7 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     name, command = thrust
     mass = mass_of(log, vehicle)
     measurement = "acc_b"
-    if mass is None:
+    if mass is None and vehicle.mass:
         mass = _mass_by(log, vehicle, _along_path(log))
         measurement = "path"
     if mass is not None:
