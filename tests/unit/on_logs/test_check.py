@@ -629,6 +629,18 @@ def test_a_map_that_carries_no_vehicle_is_found_by_the_path(times, verdict):
     assert row.figures["mass_kg"] == approx(0.2 * times, rel=0.05)
 
 
+@mark.parametrize("jump_deg", [0.0, 95.0])
+def test_a_reset_of_an_attitude_makes_its_rates_no_other_flights(jump_deg):
+    """An autopilot turns its estimate about the vertical when it first knows north."""
+    columns = flight(20.0, scale=0.05)
+    turned = Rotation.from_euler("z", jump_deg, degrees=True)
+    early = columns["time"] < 1.2
+    before = turned * Rotation.from_quat(columns["quat_wb"][early])
+    columns["quat_wb"][early] = before.as_quat()
+    rows = [row for row in physics.look(log_of(columns)) if "rate_b" in row.channel]
+    assert {row.verdict for row in rows} == {"ok"}
+
+
 @mark.parametrize(("count", "judged"), [(20, False), (60, True)])
 def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
     time = np.arange(0.0, 2.0, 0.02)

@@ -232,23 +232,30 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     proposal.why[entry.name] += f"; {unit} by the mass: it carries {masses[unit]:.4g} kg"
     if unit != entry.unit:
         proposal.mapping = proposal.mapping.with_entry(replace(entry, unit=unit))
-    off = np.log(masses[unit] / weighed)
-    if off < -thrust_checks.MASS_WARN:
+    if doubt := _doubt_of_mass(np.log(masses[unit] / weighed), "payload_pos_w" in log):
         proposal.questions.append(
             f"{thrust} carries {masses[unit]:.4g} kg in {unit}, and the vehicle weighs {weighed:g}"
-            " kg: of another battery, or a share of the full thrust?"
-        )
-    if off > thrust_checks.MASS_WARN and "payload_pos_w" not in log:
-        proposal.questions.append(
-            f"{thrust} carries {masses[unit]:.4g} kg, and the vehicle weighs {weighed:g} kg: does a"
-            " load hang below? The model has none; map its position as payload_pos_w and add"
-            " [flyer.cable]"
+            f" kg: {doubt}"
         )
     if in_grams:
         proposal.questions.append(
             f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or"
             f" {weighed:g} g and {in_grams}?"
         )
+
+
+def _doubt_of_mass(off: float, hangs: bool) -> str:
+    """Ask what makes a thrust carry another mass than the vehicle's, by the logarithm of their
+    ratio; "" for what a battery's charge makes.
+    """
+    if off < -thrust_checks.MASS_WARN:
+        return "of another battery, or a share of the full thrust?"
+    if off > thrust_checks.MASS_WARN and not hangs:
+        return (
+            "does a load hang below? The model has none; map its position as payload_pos_w and add"
+            " [flyer.cable]"
+        )
+    return ""
 
 
 def _carried(log: FlightLog) -> float | None:

@@ -18,6 +18,8 @@ from visthrow.logs.samples import Samples
 # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
 # to be compared
 MOVES = 0.05
+_FASTEST_TURN = 40.0  # from sample to sample: above, an attitude jumps [rad/s]
+_AROUND_JUMP = 0.06  # rates are taken over as much [s]
 STEEPEST = 75.0  # median tilt of a flight [deg]
 TURNED = 30.0  # by which no mount is off, and forces of a flight do not point aside [deg]
 
@@ -161,10 +163,22 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
 
 def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
     measured = log.samples("rate_b")
-    derived = log[quat].samples().rates()
+    derived = _steady_rates(log[quat].samples())
     turns = usable(derived, MOVES) or usable(measured, MOVES)
     if turns and usable(derived, 0.0) and usable(measured, 0.0):
         yield from _compared(derived, measured, f"rate of {quat}, rate_b")
+
+
+def _steady_rates(attitudes: Samples) -> Samples:
+    """Return body rates of attitudes but for those across a jump, as of an estimate's reset."""
+    rates = attitudes.rates()
+    fine = attitudes.rates(0.0)
+    jumps = fine.time[np.linalg.norm(fine.values, axis=1) > _FASTEST_TURN]
+    if not len(jumps):
+        return rates
+    first = np.searchsorted(jumps, rates.time - _AROUND_JUMP)
+    steady = first == np.searchsorted(jumps, rates.time + _AROUND_JUMP)
+    return Samples(rates.time[steady], rates.values[steady])
 
 
 def _compared(
