@@ -403,10 +403,10 @@ class TestFlyer:
 
     def test_a_log_without_a_window_is_refused_by_height_and_thrust(self):
         log = fly(3.0)
-        low = log["pos_w"].values - [0.0, 0.0, np.max(log["pos_w"].values[:, 2]) - 0.1]
-        sunk = with_channels(log, pos_w=replace(log["pos_w"], values=low))
-        with raises(LogError, match=r"pos_w rises to 0\.1 m, windows are above lowest = 0\.\d+ m"):
-            FlyerModel([sunk], FLYER)
+        highest = np.max(log["pos_w"].values[:, 2])
+        above = replace(FLYER, lowest=highest + 0.5)
+        with raises(LogError, match=rf"pos_w rises to {highest:.3g} m, windows are above lowest ="):
+            FlyerModel([log], above)
         weak = replace(FLYER, thrust_map=tuple(1e-3 * c for c in FLYER.thrust_map))
         with raises(LogError, match=r"carries up to 0\.00\d+ of the weight, windows at least 0\.3"):
             FlyerModel([log], weak)
