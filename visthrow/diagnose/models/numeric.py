@@ -90,7 +90,7 @@ class NumericModel(Model, ABC):
         self.params = params
         self.stretches = self.cut(logs)
         if not self.stretches:
-            full = [log for log in logs if all(_holds(log, name) for name in self.needed)]
+            full = [log for log in logs if all(log.samples(name, 1) for name in self.needed)]
             raise LogError(
                 f"no stretch of these logs shows {', '.join(self.channels)} in a way that this"
                 f" model explains{self.without_windows(full)}"
