@@ -138,12 +138,10 @@ def throw_model(
     commands put right.
     """
     from visthrow.common.compute_device import resolve_for_warp
-    from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import load_experiment, plant_of
 
-    threads.keep_freed_memory()
     experiment = load_experiment(args.plant, args.overrides)
     only = args.only.split(",") if args.only is not None else None
     measured = {

@@ -1,11 +1,8 @@
-"""Threads and memory of the linear algebra: its matrices are of some hundred rows, on which several
-threads a product wait for each other.
+"""Threads of the linear algebra: its matrices are of some hundred rows, on which several threads a
+product wait for each other.
 
-So each product has one thread, and windows are spread over the cores. Thousands of arrays of a few
-hundred kilobytes are taken and freed."""
+So each product has one thread, and windows are spread over the cores."""
 
-import ctypes
-import gc
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -20,28 +17,6 @@ R = TypeVar("R")
 
 THREADS = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
 PIECES = 4  # of what is to be done, for each thread
-TRIM_THRESHOLD = -1  # options of ``mallopt``, as glibc's ``malloc.h`` numbers them
-MMAP_THRESHOLD = -3
-BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
-# bytes from which an array has a mapping of its own, which goes back when it is freed
-MAPPED = 2**30
-
-
-@cache
-def keep_freed_memory() -> None:
-    """Let this process keep what it frees for what it takes next, and look for garbage among new
-    objects alone.
-
-    By default glibc gives large arrays' pages back to the system and faults them in anew: of looks
-    at noise levels, one after the other, half the time was the kernel's. A third of a million
-    objects of the modules are never garbage."""
-    gc.freeze()
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError, TypeError):  # another C library
-        return
-    mallopt(MMAP_THRESHOLD, MAPPED)
-    mallopt(TRIM_THRESHOLD, BYTES_KEPT)
 
 
 def limit_to_one_thread() -> None:

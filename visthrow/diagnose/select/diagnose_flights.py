@@ -10,7 +10,7 @@ from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names, Scatter
@@ -128,7 +128,6 @@ def explain(
     Raises DiagnoseError: the model gives no window, or contradicts itself."""
     begun = time.monotonic()
     say = progress or (lambda _: None)
-    keep_freed_memory()
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
