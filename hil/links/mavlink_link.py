@@ -16,7 +16,7 @@ from hil.links.device import Port, chunks
 from hil.links.pymav import Parser, Signed, mav
 from hil.links.roster import Address, Roster, Traffic, address_text
 from hil.links.writer import TlogWriter
-from hil.poses.pose import Pose, Quaternion, Vector
+from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from visthrow.common.rotations import quat_of_euler, rotate_one
 
 LOCAL_FRAMES = (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_LOCAL_FRD)
@@ -179,7 +179,7 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     quat = tuple(message.q)
     vel = _known((message.vx, message.vy, message.vz))
     if vel is not None and message.child_frame_id in BODY_FRAMES:
-        vel = rotate_one((*quat[1:], quat[0]), vel)
+        vel = rotate_one((*quat[1:], quat[0]), vel) if has_attitude(quat) else None
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
     rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))

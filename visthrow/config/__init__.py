@@ -55,6 +55,16 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
     return _build(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
 
+def load_dict(
+    schema: type[T], values: dict[str, Any], overrides: Iterable[str] = (), name: str = "(values)"
+) -> T:
+    """Build a config from nested dictionaries, such as :func:`to_dict` gives, which messages call
+    by a name, as :func:`loads` does from text.
+    """
+    tree = _complete(schema, spell_none(values), name, configs_root(), ())
+    return _build(schema, tree, overrides)
+
+
 def _build(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
     overrides = tuple(overrides)
     for override in overrides:
@@ -187,6 +197,15 @@ def _parse(
         raise ConfigError(f"{name}: no valid TOML: {error}") from None
     except RecursionError:
         raise ConfigError(f"{name}: no valid TOML: brackets are nested too deeply") from None
+    return _complete(schema, raw, name, folder, stack)
+
+
+def _complete(
+    schema: type, raw: dict[str, Any], name: str, folder: Path, stack: tuple[Path, ...]
+) -> ConfigTable:
+    """Put parsed TOML on top of the file that it names as its base, with the files that it includes
+    in their places.
+    """
     # A schema may itself have a field called "base"; then the word is an ordinary key.
     base = raw.pop(BASE_KEY, None) if BASE_KEY not in _schema.hints(schema) else None
     tree = _schema.as_table(raw, name)

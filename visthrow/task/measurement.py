@@ -45,9 +45,9 @@ def as_flown(experiment: Experiment) -> Experiment:
     """Return the experiment as its policies are flown and measured: without training's faults."""
     if not experiment.flown:
         return experiment
-    text = config.dumps(experiment)
+    values = config.to_dict(experiment)
     name = "the configuration of the training"
-    return config.loads(Experiment, text, experiment.flown, name=name)
+    return config.load_dict(Experiment, values, experiment.flown, name=name)
 
 
 def blank_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:

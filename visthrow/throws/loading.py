@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 from sim.params import AirParams, changed
 from visthrow import config
-from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
 from visthrow.onboard.policy import Policy, find_policy, flatten
 from visthrow.task import Experiment, contract_of, load_experiment
@@ -129,10 +128,9 @@ def training_experiment(
     # newer one.
     layout = policy.contract.get("observation", {}).get("layout", "state")
     learning = config.to_dict(load_experiment(layout).ppo)
-    text = toml_text.dumps(config.spell_none({**trained, "ppo": learning}))
-    return config.loads(
+    return config.load_dict(
         kind,
-        text,
+        {**trained, "ppo": learning},
         [*trained.get("flown", ()), *overrides],
         name=f"{path} (the config it was trained with)",
     )

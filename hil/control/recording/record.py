@@ -27,8 +27,6 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, StorageError
 from visthrow.common.storage import atomic_write, write_json
-from visthrow.common.toml_text import dumps
-from visthrow.config.schema import NONE_WORD
 from visthrow.onboard.policy import Policy, find_policy
 
 POLICY = "policy.npz"
@@ -165,7 +163,7 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
     return all((folder / name).is_file() for name in parts)
 
 
-def _replayable(path: Path) -> str:
+def _replayable(path: Path) -> dict[str, Any]:
     """Return config of a run without what only reads the recording's source: its poses are here,
     and its form has changed before. Keys that are newer than the run have their shipped values; a
     run from before the aim holds no release back.
@@ -182,7 +180,7 @@ def _replayable(path: Path) -> str:
         for key, value in tree.get("source", {}).items()
         if key not in ("columns", "time")
     }
-    return dumps({"aim": NONE_WORD} | tree | {"base": BASE})
+    return {"aim": None} | tree | {"base": BASE}
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:
@@ -209,7 +207,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
 
 def load_setup(folder: Path) -> tuple[HilParams, Policy]:
     """Return config and policy of a run, also of one that goes on."""
-    params = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG))
+    params = config.load_dict(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG))
     return params, Policy.load(folder / POLICY)
 
 

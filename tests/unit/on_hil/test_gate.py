@@ -3,6 +3,7 @@ a clock does.
 """
 
 import math
+from dataclasses import replace
 
 from numpy.testing import assert_allclose
 from pytest import approx, mark, raises
@@ -37,7 +38,7 @@ def begun() -> Gate:
         (pose(0.01, 0.01), None),
         (pose(0.01, math.nan), "finite"),
         (pose(0.01, math.inf), "finite"),
-        (pose(0.01, quat=(0.0, 0.0, math.nan, 1.0)), "finite"),
+        (pose(0.01, quat=(0.0, 0.0, math.nan, 1.0)), "attitude"),
         (pose(0.01, 0.01, (0.0, 0.0, 0.0, 0.0)), "quaternion"),
         (pose(0.01, 0.5), "speed"),
         (pose(0.01, 0.01, vel=(math.nan, 0.0, 0.0)), "finite"),
@@ -148,9 +149,11 @@ def test_staleness_is_of_content_not_of_arrival():
 def test_a_single_marker_is_a_position(quat):
     """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
     for turns, reason in ((True, "quaternion"), (False, None)):
-        track = Track(FRAMES, PARAMS, EstimateParams(0.055, 2), turns)
-        refused = track.update(pose(0.0, 0.1, quat))
-        assert refused == ("finite" if turns and math.isnan(sum(quat)) else reason)
+        reason = "attitude" if turns and math.isnan(sum(quat)) else reason
+        for offset in ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)):  # which an attitude turns
+            frames = replace(FRAMES, marker_offset_b=offset)
+            track = Track(frames, PARAMS, EstimateParams(0.055, 2), turns)
+            assert track.update(pose(0.0, 0.1, quat)) == reason
         zeros = Pose(1.0, 1.0, "payload", (0.0, 0.0, 0.0), quat)
         assert track.update(zeros) == "invalid"
         assert track.update(pose(0.01, 0.1, valid=False)) == "invalid"

@@ -161,6 +161,10 @@ def test_what_the_fields_mean():
     assert (east.rate, east.reset, east.stamp, east.body) == ((0.1, 0.2, 0.3), 7, 2.0, "payload")
     assert pose_from_message(odometry(child=20), "vehicle", 0.0).vel == (1.0, 2.0, 3.0)
     assert pose_from_message(odometry(vel=(math.nan, 0.0, 0.0)), "vehicle", 0.0).vel is None
+    for none in (math.nan, 0.0):  # what turns the velocity is not known, so neither is the velocity
+        assert pose_from_message(odometry(q=(none,) * 4), "payload", 0.0).vel is None
+        told = odometry(child=20, q=(none,) * 4)
+        assert pose_from_message(told, "payload", 0.0).vel == (1.0, 2.0, 3.0)
     assert pose_from_message(odometry(frame=0), "vehicle", 0.0) is None
     assert pose_from_message(MESSAGES[3], "vehicle", 0.0) is None
 

@@ -262,8 +262,8 @@ def test_none_word_overrules_a_default(write):
 
 
 def test_toml_writer_refuses_what_toml_lacks():
-    for value in (float("nan"), None, object()):
-        with raises(ValueError, match=r"a\.b"):
+    for value in (None, object()):
+        with raises(ValueError, match="TOML item"):
             toml_text.dumps({"a": {"b": value}})
 
 
