@@ -137,6 +137,12 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
             f" diagnose check {path}"
         )
     if not path.is_file() and not bag:
+        parts = str(path).split("+")
+        if len(parts) > 1 and Path(parts[0]).exists():
+            raise LogError(
+                f"{path}: {len(parts)} files; expected one: a mapping is of one table. `check` and"
+                " `explain` join logs"
+            )
         raise _missing(path)
     if path.name.lower().endswith(TABLES):
         return table.read_table(path)

@@ -208,6 +208,9 @@ def test_what_is_not_known_is_asked(tmp_path):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
     with raises(LogError, match=r"a\.ulg: describes its own contents"):
         table_of(tmp_path / "a.ulg")
+    (tmp_path / "a.csv").write_text("t,x\n")
+    with raises(LogError, match="2 files; expected one: a mapping is of one table"):
+        table_of(f"{tmp_path}/a.csv+{tmp_path}/b.csv")
 
 
 def unnamed(
