@@ -39,7 +39,7 @@ def noise(rng, count: int, colour: str) -> np.ndarray:
 def flown(seed: int, colour: str, **options) -> SyntheticModel:
     """Flights whose sensors have noise of a colour."""
     model = SyntheticModel(
-        effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=4, **options
+        effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=2, **options
     )
     rng = default_rng([seed, 1])
     for i, window in enumerate(model._windows):

@@ -434,7 +434,7 @@ class TestImu:
         0.5 ms of the test's own, an accelerometer off by 0.2 m/s^2.
         """
         p, rng, step = IMU, default_rng(seed), 5e-4
-        time = np.arange(0.0, 8.0, step)
+        time = np.arange(0.0, 5.0, step)
         arm = p.torque.arm_x
         mixer = np.array(
             [[arm, -arm, arm, -arm], [-arm, -arm, arm, arm], [0.006, -0.006, -0.006, 0.006]]
