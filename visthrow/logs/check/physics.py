@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back, tilt_deg
-from visthrow.logs.axes import is_mirror
+from visthrow.logs.axes import EXCHANGES, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
 from visthrow.logs.flightlog import FlightLog
@@ -439,6 +439,7 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     relation = relations.relate(*best, reach=_DELAY_BAD)
     correlation = min(max(abs(turned), mirrored), 0.999)
     nats = 0.5 * span / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - correlation**2))
+    nats -= np.log(len(EXCHANGES))  # an angle is a choice like that among exchanges
     surely = nats > _NATS and correlation > max(_CORRELATED, plain + CLEARLY)
     if relation is None or not surely:
         return None
