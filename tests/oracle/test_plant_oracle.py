@@ -60,7 +60,7 @@ def test_whole_plant(name):
     plant = plant_of(changes)
     pos, still = np.tile([0.0, 0.0, 2.0], (COUNT, 1)), np.zeros((COUNT, 3))
     vel = np.random.default_rng(0).normal(size=(COUNT, 3)) * 0.5
-    reference = ReferencePlant(plant, count=COUNT, step=5e-4)
+    reference = ReferencePlant(plant, count=COUNT, step=2e-3)
     reference.reset(pos, np.tile([0.0, 0.0, 0.0, 1.0], (COUNT, 1)), vel, still)
     sims, separation = {}, {}
     for precision in PRECISIONS.get(name, ("float64",)):
