@@ -354,10 +354,10 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     wrong = _exchanged(relation, channels)
     if wrong is None and sensed:
         wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
-    if wrong is None:
-        yield from _pushed(relation, acc, pushed, channels, sensed)
-    else:
+    if wrong is not None:
         yield wrong
+    if wrong is None or wrong.verdict == "warn":
+        yield from _pushed(relation, acc, pushed, channels, sensed)
 
 
 def _carried(
@@ -445,16 +445,19 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
         return None
     angle = np.degrees(np.angle(turned))
     quarters = abs(angle - 90.0 * round(angle / 90.0))
-    if mirrored > abs(turned) or (abs(angle) > TURNED and quarters < 0.5 * TURNED):
+    is_mirror_image = mirrored > abs(turned)
+    # axes that are exchanged do not correlate as they are
+    if plain < BELONGS and (is_mirror_image or quarters < 0.5 * TURNED < abs(angle)):
         figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
         return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
-    if abs(angle) < TURNED:
+    if is_mirror_image or abs(angle) < TURNED:
         return None
+    # a warning: of an estimated attitude, which leans, a circle looks turned as well
     text = (
         f"acc_b fits turned by {angle:+.0f} deg about z, {nats:.0f} nats better (correlation"
         f" {correlation:.2f}, not {plain:.2f}): its mount, or axes of the attitude"
     )
-    return Row("frames", channels, "bad", text, {"turned_deg": angle, "of": "acc_b", "nats": nats})
+    return Row("frames", channels, "warn", text, {"turned_deg": angle, "of": "acc_b", "nats": nats})
 
 
 def _level_correlations(first: np.ndarray, second: np.ndarray) -> tuple[complex, complex]:
