@@ -453,7 +453,7 @@ ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 
 def test_lost_commands_are_found_beside_a_cause():
     setting = setting_with({"com_x": 0.003})
-    logs = fly(setting, seed=4, free=1, throws=1, seconds=2.0, lost=SHARE)
+    logs = fly(setting, seed=4, free=1, throws=2, seconds=3.0, lost=SHARE)
     diagnosis = explain(ThrowModel(logs, paper_plant(), only=ONLY))
     (found,) = [share for share in diagnosis.scatter if share.found]
     assert (diagnosis.overall, diagnosis.named, found.name) == ("KNOWN", ("com_x",), dropped.NAME)
