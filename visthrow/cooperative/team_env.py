@@ -5,16 +5,15 @@ they end together. As in :class:`visthrow.training.env.ThrowEnv`, nothing branch
 rollout can be captured."""
 
 import math
+from typing import ClassVar
 
 import torch
 import warp as wp
-from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
 from camera import arrays
 from camera.keypoint_noise import DetectorView
-from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.common.compute_device import rounded_products
 from visthrow.common.free_fall import free_flight
@@ -23,17 +22,10 @@ from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.task import plant_of, rewards, terminations
-
-RESULTS = {
-    "released": "episodes",
-    "landing_error": "released",
-    "duration": "released",
-    "contact": "episodes",
-}
-"""Sums over finished worlds, errors in [m] and durations in [s], and what their means are over."""
+from visthrow.training.env.throw_episodes import ThrowEpisodes
 
 
-class TeamEnv(VecEnv):
+class TeamEnv(ThrowEpisodes):
     """Worlds of a team. Observation groups: ``actor`` and ``critic``.
 
     The critic sees all vehicles, its own first, without noise, the load with its velocity, the
@@ -46,6 +38,8 @@ class TeamEnv(VecEnv):
             ``clearance`` [m], ``gap`` [m], ``apart`` [s], between first and last separation, the
             load's position [m] and velocity [m/s] at the end of the step.
     """
+
+    results: ClassVar = ThrowEpisodes.results | {"contact": "episodes"}
 
     def __init__(
         self,
@@ -89,43 +83,24 @@ class TeamEnv(VecEnv):
         rows = torch.arange(self.rows, device=device)
         self._segment = ropes[rows % len(ropes)]
         self._mount = like.new_tensor(plant.rope.mount)
-        hover = act.hover_action(GRAVITY * plant.total_mass, task.action.max_thrust)
-        self._start_action = like.new_tensor(hover)
-        self._max_rate = like.new_tensor(task.action.max_rate)
         samples = experiment.release.clearance_samples
         self._fractions = torch.linspace(0.0, 1.0, samples, device=device)
-        self._rate_weights = like.new_tensor(task.reward.rate_command)
-        self._change_weights = like.new_tensor(task.reward.command_change)
-        self.episode_length_buf = like.new_zeros(self.rows, dtype=torch.long)
-        self._memory = self._carried_buffers(like)
+        self._allocate(like)
         self.earliest = like.new_zeros((), dtype=torch.long)
-        self.last: dict[str, Tensor] = {}
-        self._goal: Tensor | None = None
         self.reset()
 
-    def _carried_buffers(self, like: Tensor) -> dict[str, Tensor]:
-        """The buffers that an episode carries beside the simulator's state."""
-        rows = self.rows
+    def _allocate(self, like: Tensor) -> None:
+        super()._allocate(like)
         worlds = self.worlds
         steps = 2 + math.ceil(self.cfg.team.age[1] / self.cfg.sim.control_period)
-        history = 1 + self.layout.history
-        payload = self.layout.payload
-        shapes = {
-            "previous": (rows, act.ACTIONS),
-            "history": (rows, history, payload),
-            "true_history": (rows, history, 3),
-            "frame_bias": (rows, ob.VEHICLE + 5),
-            "command_bias": (rows, act.COMMANDS),
-            "pose_age": (rows,),
-            "age": (worlds,),
-            "poses": (rows, steps, ob.VEHICLE + 3),
-            "requests": (worlds, steps),
-            "first": (worlds,),
-            "tripped": (worlds,),
+        self.buffers |= {
+            "pose_age": torch.zeros_like(like),
+            "age": like.new_zeros(worlds),
+            "poses": like.new_zeros(self.rows, steps, ob.VEHICLE + 3),
+            "requests": like.new_zeros(worlds, steps),
+            "first": like.new_zeros(worlds),
+            "tripped": like.new_zeros(worlds),
         }
-        memory = {name: like.new_zeros(shape) for name, shape in shapes.items()}
-        memory["totals"] = like.new_zeros(1 + len(RESULTS), dtype=torch.float64)
-        return memory
 
     def _rows(self, of_worlds: Tensor) -> Tensor:
         """Values of worlds, shape (W, ...), for their rows."""
@@ -144,21 +119,6 @@ class TeamEnv(VecEnv):
         """Values of the k-th vehicle after each row's own in its world."""
         return self._worlds(of_rows).roll(-k, 1).flatten(0, 1)
 
-    def fix_goal(self, goal_w: Tensor | None) -> None:
-        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones."""
-        self._goal = goal_w
-
-    def clear_totals(self) -> None:
-        """Start the sums again."""
-        self._memory["totals"].zero_()
-
-    def episode_means(self) -> dict[str, float]:
-        """Means over the worlds that finished since :meth:`clear_totals`, and their number."""
-        names = ("episodes", *RESULTS)
-        totals = dict(zip(names, self._memory["totals"].tolist(), strict=True))
-        means = {name: totals[name] / max(totals[of], 1.0) for name, of in RESULTS.items()}
-        return means | {"episodes": totals["episodes"]}
-
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
         fresh = torch.ones(self.worlds, device=self.device, dtype=torch.bool)
@@ -166,21 +126,14 @@ class TeamEnv(VecEnv):
         self._observations = self._observe(self._rows(fresh))
         return self._observations
 
-    def get_observations(self) -> TensorDict:
-        """Observations of the current step."""
-        return self._observations.clone()
-
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply unclipped actions, shape (E, 5) or (W, V 5), for one control period; worlds that
         end start anew.
         """
         action = self._apply(actions.reshape(-1, act.ACTIONS))
         reward, done = self._judge(action)
-        hit = self.last["released"].float()
-        parts = [done.float(), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
-        parts.append((self.last["contact"] & done).float())
-        self._memory["totals"] += torch.stack(parts).sum(-1, dtype=torch.float64)
-        self._memory["previous"].copy_(action)
+        self._count(done, (self.last["contact"] & done).float())
+        self.previous_action.copy_(action)
         self._start(done)
         rows = self._rows(done)
         self._observations = self._observe(rows)
@@ -192,13 +145,8 @@ class TeamEnv(VecEnv):
 
         Latches trip together, where all asked as long ago as the members know of one another.
         """
-        task = self.cfg.task
-        memory = self._memory
-        action = act.clip_action(actions)
-        noise = torch.randn_like(memory["command_bias"]) * task.noise.command_step
-        noisy = action[:, : act.COMMANDS] + noise + memory["command_bias"]
-        command = act.command_from_action(noisy, task.action.max_thrust, self._max_rate)
-        self.views.command.copy_(command)
+        memory = self.buffers
+        action = self._command(actions)
         requests = self._worlds(act.wants_release(actions, self.cfg.release.threshold)).all(1)
         requests &= self.episode_length_buf[:: self.team] >= self.earliest
         fresh = torch.zeros_like(requests)
@@ -239,7 +187,7 @@ class TeamEnv(VecEnv):
     def _handle_landings(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Worlds whose last vehicle has let go in this step, and what follows from it."""
         out = self.views.out
-        memory = self._memory
+        memory = self.buffers
         separated = self._worlds(out["separated"]) != 0
         attached = self._worlds(self.views.state["attached"] != 0).any(1)
         when = torch.where(separated, self._worlds(out["separation_time"]), -1.0)
@@ -285,11 +233,7 @@ class TeamEnv(VecEnv):
         negative = ~released & (self._worlds(ended).any(1) | contact)
         miss = landing["landing_w"] - self.views.goal_w[:: self.team]
         error = miss[:, :2].norm(dim=-1)
-        load_vel = self._rows(self.load_vel_w)
-        previous = self._memory["previous"]
-        attached = rewards.kinetic(p, state["vel_w"], state["rate_b"], load_vel)
-        attached = attached + rewards.command(p, action, self._rate_weights)
-        attached = attached + rewards.change(p, action, previous, self._change_weights)
+        attached = self._carry_reward(action, self._rows(self.load_vel_w))
         at_release = rewards.release_reward(
             p, error, landing["time_to_impact"], landing["clearance"], release.clearance_margin
         )
@@ -304,8 +248,7 @@ class TeamEnv(VecEnv):
     def _start(self, fresh: Tensor) -> None:
         """Start worlds where ``fresh``, bool, shape (W,)."""
         task = self.cfg.task
-        memory = self._memory
-        noise = self.cfg.task.noise
+        memory = self.buffers
         rows = self._rows(fresh)
         mask = rows.to(torch.int32)
         with on_torch_stream(self.device):
@@ -313,14 +256,10 @@ class TeamEnv(VecEnv):
             self._form(fresh)
             self.sim.adopt(wp.from_torch(mask))
         self._kept = mask  # until the launches have read it
-        self.episode_length_buf.masked_fill_(rows, 0)
-        previous = memory["previous"]
-        torch.where(rows[:, None], self._start_action, previous, out=previous)
+        self._restart(rows)
         memory["requests"].masked_fill_(fresh[:, None], 0.0)
         memory["first"].masked_fill_(fresh, 1e6)
         memory["tripped"].masked_fill_(fresh, 0.0)
-        spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
-        arrays.redraw(memory, spreads, rows)
         self.view.begin(rows)
         age = memory["pose_age"]
         latency = between(task.observation.latency, torch.rand_like(age))
@@ -367,8 +306,7 @@ class TeamEnv(VecEnv):
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state; ``fresh``: rows that begin."""
         state = self.views.state
-        memory = self._memory
-        noise = self.cfg.task.noise
+        memory = self.buffers
         load = self._rows(self.load_w)
         goal = self.views.goal_w
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
@@ -377,10 +315,7 @@ class TeamEnv(VecEnv):
         memory["poses"].copy_(poses)
         period = self.cfg.sim.control_period
         pose = arrays.at_latency(poses, memory["pose_age"] / period)
-        vehicle_measured = pose[:, : ob.VEHICLE]
-        offset = ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])
-        frame = torch.cat([vehicle_measured, offset], -1)
-        frame = frame + torch.randn_like(frame) * noise.observation_step + memory["frame_bias"]
+        frame = self._measure(self._state_frame(pose, goal))
         valid = None
         if self.layout.name == "vision":
             eye = (pose[:, :3], ob.rotation_in(pose))
@@ -408,14 +343,14 @@ class TeamEnv(VecEnv):
         the control steps since the latches tripped.
         """
         noise = self.cfg.task.noise.observation_step
-        age = self._rows(self._memory["age"]) / self.cfg.sim.control_period
+        age = self._rows(self.buffers["age"]) / self.cfg.sim.control_period
         late = arrays.at_latency(poses, age)
         parts = []
         for k in range(1, self.team):
             neighbour = self._neighbour(late, k)
             place = neighbour[:, :3] + torch.randn_like(pos_w) * noise - pos_w
             parts += [place, neighbour[:, 9 : ob.VEHICLE]]
-        tripped = self._rows(self._memory["tripped"])
+        tripped = self._rows(self.buffers["tripped"])
         return torch.cat([*parts, torch.stack([age, tripped], -1)], -1)
 
     def _critic_view(
@@ -423,7 +358,7 @@ class TeamEnv(VecEnv):
     ) -> Tensor:
         """Critic's view."""
         state = self.views.state
-        memory = self._memory
+        memory = self.buffers
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
         history = arrays.push(memory["true_history"], offset[:, 2:], fresh)
         memory["true_history"].copy_(history)

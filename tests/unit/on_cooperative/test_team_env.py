@@ -30,7 +30,7 @@ def env() -> TeamEnv:
 
 
 def hover(env: TeamEnv, rho: torch.Tensor) -> torch.Tensor:
-    actions = env._start_action.expand(env.num_envs, -1).clone()
+    actions = env.start_action.expand(env.num_envs, -1).clone()
     actions[:, 4] = rho
     return actions
 
@@ -64,7 +64,7 @@ def test_one_policy_of_both_sees_with_both_and_releases_at_once():
     assert observed.shape == (4, 2 * env.layout.dimension)
     places = observed.unflatten(1, (2, -1))[:, :, :3].flatten(0, 1)
     assert_close(places, env.views.state["pos_w"], atol=0.2, rtol=0.0)
-    actions = env._start_action.tile(4, 2)
+    actions = env.start_action.tile(4, 2)
     actions[:, 4::5] = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     _, reward, done, _ = env.step(actions)
     tripped = env._worlds(env.views.state["release_timer"] >= 0.0)

@@ -6,14 +6,13 @@ or copies to the host, so a whole rollout can be captured in one CUDA graph
 
 import torch
 import warp as wp
-from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
 from camera import arrays
 from camera.keypoint_noise import DetectorView
 from sim.hybrid import HybridSim, rope_variants
-from sim.params import GRAVITY, RopeParams
+from sim.params import RopeParams
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.common.compute_device import rounded_products
 from visthrow.onboard import actions as act
@@ -22,9 +21,10 @@ from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, draw_plants, plant_of, rewards, terminations
 from visthrow.task.fleet import Member, members
 from visthrow.training.env.options import FleetSetup, MovingGoals, PoseDelay
+from visthrow.training.env.throw_episodes import ThrowEpisodes
 
 
-class ThrowEnv(VecEnv):
+class ThrowEnv(ThrowEpisodes):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
     The critic sees what ``ppo.privileged`` names. ``exact``: vehicle, goal offset and payload
@@ -77,7 +77,6 @@ class ThrowEnv(VecEnv):
             length = experiment.rope.length
             scales = [[r.payload_mass / mass, r.length / length] for r in ropes]
             self._cargo = like.new_tensor(scales)[row]
-        self._goal: Tensor | None = None
         self.reset()
 
     def _build(self, fleet: list[Member], seed: int) -> tuple[list[RopeParams], int]:
@@ -101,44 +100,17 @@ class ThrowEnv(VecEnv):
         return ropes, share
 
     def _allocate(self, like: Tensor) -> None:
-        """Allocate weights, limits and the buffers that an episode carries besides the simulator's
-        state and the parts' buffers.
-        """
-        task = self.cfg.task
+        super()._allocate(like)
         E = self.num_envs
         if self._fleet:
-            self._max_thrust: float | Tensor = self._fleet.max_thrust
+            self.max_thrust = self._fleet.max_thrust
             self.start_action = self._fleet.start_action
             self.view.camera.radius = self._fleet.payload_radius
-        else:
-            self._max_thrust = task.action.max_thrust
-            weight = GRAVITY * plant_of(self.cfg).total_mass
-            hover = act.hover_action(weight, self._max_thrust)
-            self.start_action = like.new_tensor(hover)
-        self.max_rate = like.new_tensor(task.action.max_rate)
-        self.rate_weights = like.new_tensor(task.reward.rate_command)
-        self.change_weights = like.new_tensor(task.reward.command_change)
-        self.episode_length_buf = like.new_zeros(E, dtype=torch.long)
         self._everywhere = like.new_ones(E, dtype=torch.bool)
-        self.buffers = {
-            "previous": like.new_zeros(E, act.ACTIONS),
-            "history": like.new_zeros(E, 1 + self.layout.history, self.layout.payload),
-            "true_history": like.new_zeros(E, 1 + self.layout.history, 3),
-            "frame_bias": like.new_zeros(E, ob.VEHICLE + 5),
-            "command_bias": like.new_zeros(E, act.COMMANDS),
-            # over finished episodes: their number, those released, and of these landing errors [m]
-            # and durations [s]
-            "totals": like.new_zeros(4, dtype=torch.float64),
-        }
         if self.layout.response:
             self.buffers["answers"] = like.new_zeros(E, 1 + self.layout.response, ob.RESPONSE)
         if self.layout.fits:
             self.buffers["goal_fit"] = goal_motion.empty_sums(E, self.device)
-
-    @property
-    def previous_action(self) -> Tensor:
-        """Clipped action of the last step, shape (E, 5)."""
-        return self.buffers["previous"]
 
     def exact_frame(self, age: float) -> Tensor:
         """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control
@@ -146,11 +118,6 @@ class ThrowEnv(VecEnv):
         """
         pose = self.delay.exact(age)
         return self._state_frame(pose, self.views.goal_w)
-
-    def _state_frame(self, pose: Tensor, goal_w: Tensor) -> Tensor:
-        """State frame of a pose sample and a goal, shape (E, 20)."""
-        offset = ob.state_part(pose[:, :3], goal_w, pose[:, ob.VEHICLE :])
-        return torch.cat([pose[:, : ob.VEHICLE], offset], dim=-1)
 
     def begin_throws(self, correction: tuple[Tensor, Tensor]) -> TensorDict:
         """Begin throws where the vehicles are, with the ``correction`` that a calibration in hover
@@ -163,27 +130,6 @@ class ThrowEnv(VecEnv):
         self.previous_action.copy_(self.start_action.expand_as(self.previous_action))
         return self._look(self._everywhere)
 
-    def fix_goal(self, goal_w: Tensor) -> None:
-        """Use one goal [m], shape (3,), for all episodes from the next reset on."""
-        self._goal = goal_w
-
-    def clear_totals(self) -> None:
-        """Start the sums again."""
-        self.buffers["totals"].zero_()
-
-    def episode_means(self) -> dict[str, float]:
-        """Means over the episodes that finished since :meth:`clear_totals`, and their number.
-
-        ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are
-        means over the released."""
-        episodes, released, error, duration = self.buffers["totals"].tolist()
-        return {
-            "released": released / max(episodes, 1.0),
-            "landing_error": error / max(released, 1.0),
-            "duration": duration / max(released, 1.0),
-            "episodes": episodes,
-        }
-
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
         self._begin(self._everywhere)
@@ -193,10 +139,6 @@ class ThrowEnv(VecEnv):
         """Observe, and keep what is observed."""
         self._observations = self._observe(fresh)
         return self._observations
-
-    def get_observations(self) -> TensorDict:
-        """Observations of the current step."""
-        return self._observations.clone()
 
     def carry(self, actions: Tensor, mask: wp.array | None = None) -> TensorDict:
         """Apply unclipped actions, shape (E, 5), for one control period with the latch shut,
@@ -215,24 +157,14 @@ class ThrowEnv(VecEnv):
         negative end and must not be bootstrapped, so there are no ``time_outs``."""
         action = self._apply(actions)
         reward, done = self._judge(action)
-        hit = self.last["released"].float()
-        error = self.last["landing_error"] * hit
-        duration = self.last["duration"] * hit
-        rows = torch.stack([done.float(), hit, error, duration])
-        self.buffers["totals"] += rows.sum(-1, dtype=torch.float64)
+        self._count(done)
         self.previous_action.copy_(action)
         self._begin(done)
         return self._look(done), reward, done.float(), {}
 
     def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
         """Fly one control period; returns the clipped actions."""
-        task = self.cfg.task
-        buffers = self.buffers
-        action = act.clip_action(actions)
-        noise = torch.randn_like(buffers["command_bias"]) * task.noise.command_step
-        noisy = action[:, : act.COMMANDS] + noise + buffers["command_bias"]
-        command = act.command_from_action(noisy, self._max_thrust, self.max_rate)
-        self.views.command.copy_(command)
+        action = self._command(actions)
         asked = act.wants_release(actions, self.cfg.release.threshold)
         self.views.release.copy_(asked & (not hold))
         with on_torch_stream(self.device):
@@ -258,7 +190,6 @@ class ThrowEnv(VecEnv):
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
-        state = self.views.state
         out = self.views.out
         period = self.cfg.sim.control_period
         p = self.cfg.task.reward
@@ -268,10 +199,7 @@ class ThrowEnv(VecEnv):
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         miss = out["landing_w"] - goal
         error = miss[:, :2].square().sum(-1).sqrt()
-        kinetic = rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
-        command = rewards.command(p, action, self.rate_weights)
-        change = rewards.change(p, action, self.previous_action, self.change_weights)
-        attached = kinetic + command + change
+        attached = self._carry_reward(action, out["payload_vel_w"])
         margin = self.cfg.release.clearance_margin
         at_release = rewards.release_reward(
             p, error, out["time_to_impact"], out["clearance"], margin
@@ -299,18 +227,13 @@ class ThrowEnv(VecEnv):
 
     def _begin(self, fresh: Tensor) -> None:
         """Start episodes where ``fresh``, bool, shape (E,), and draw what stays fixed in them."""
-        noise = self.cfg.task.noise
         self._fresh = fresh.to(torch.int32)  # until the launches have read it
         with on_torch_stream(self.device):
             self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
         if self._goal is not None:
             goal_w = self.views.goal_w
             goal_w.copy_(torch.where(fresh[:, None], self._goal, goal_w))
-        self.episode_length_buf.masked_fill_(fresh, 0)
-        previous = self.previous_action
-        torch.where(fresh[:, None], self.start_action, previous, out=previous)
-        spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
-        arrays.redraw(self.buffers, spreads, fresh)
+        self._restart(fresh)
         for part in self._parts():
             part.begin(fresh)
 
@@ -332,8 +255,7 @@ class ThrowEnv(VecEnv):
         pose = self.delay.push(pose, fresh)
         late_goal = self._goal_in(-self.delay.age)
         true_frame = self._state_frame(pose, late_goal)
-        noise = torch.randn_like(true_frame) * self.cfg.task.noise.observation_step
-        measured = true_frame + noise + buffers["frame_bias"]
+        measured = self._measure(true_frame)
         valid = None
         if self.layout.name == "vision":
             if self.cfg.task.observation.oldest > 0.0:
