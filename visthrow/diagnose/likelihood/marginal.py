@@ -342,13 +342,13 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
     count = len(residual)
     channels = len(gram.count)
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
-    weighted = np.zeros((count, channels))
-    weighted[np.arange(count), window.channel] = _unwhitened(window, white) / window.sigma
-    by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
+    weighted = np.zeros((channels, count))
+    weighted[window.channel, np.arange(count)] = _unwhitened(window, white) / window.sigma
+    by_state = weighted @ window.nuisance * window.nuisance_sd
     by_latent = np.zeros((channels, 0))
     if gram.latents:
-        by_latent = (window.latent.T @ weighted).T @ gram.factor
-    by_effect = (window.effects.T @ weighted).T * floors
+        by_latent = weighted @ window.latent @ gram.factor
+    by_effect = weighted @ window.effects * floors
     square = np.bincount(window.channel, white**2, channels)
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 

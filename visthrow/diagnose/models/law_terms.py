@@ -256,8 +256,12 @@ def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
     names = dict.fromkeys(term.vector for term in terms)
     factors = dict.fromkeys(term.factors for term in terms)
     directions = np.stack([vectors[name].read(values) for name in names], axis=-1)
-    products = np.stack([_product(scalars, values) for scalars in factors], axis=-1)
-    every = products[:, None, :, None] * directions[:, :, None, :]
+    products = {(): np.ones(len(directions))}
+    for scalars in factors:
+        if scalars:
+            *others, name = scalars
+            products[scalars] = products[tuple(others)] * SCALARS[name].read(values)
+    every = np.stack([*products.values()], axis=-1)[:, None, :, None] * directions[:, :, None]
     return every.reshape(len(directions), 3, len(terms))
 
 

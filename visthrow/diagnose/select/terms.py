@@ -30,6 +30,7 @@ from visthrow.diagnose.models.law_terms import (
     JOINT,
     SCALARS,
     SYMBOLS,
+    VECTORS,
     KnotValues,
     Term,
     carries,
@@ -165,11 +166,12 @@ class Survey:
         acting = gram.latent_block == LATENT_BLOCKS.index(level_block(block))
         exerted = transfer[acting] @ values
         square = (exerted**2).sum(0).reshape(terms, columns).sum(1)
-        loads = solve_triangular(gram.factor, transfer, lower=True) @ values
-        informed = (of_latents[:, latents] @ loads).reshape(-1, terms, columns)
-        score = self.parts.absolute.score[w, latents] @ loads
-        cross = (loads.T @ of_latents[:, :count]).reshape(terms, columns, -1)
-        information = np.einsum("lti,ltj->tij", loads.reshape(informed.shape), informed)
+        carried = solve_triangular(gram.factor, transfer, lower=True)
+        informed = carried.T @ of_latents[:, latents] @ carried @ values
+        score = self.parts.absolute.score[w, latents] @ carried @ values
+        cross = (values.T @ (carried.T @ of_latents[:, :count])).reshape(terms, columns, -1)
+        parts = (part.reshape(-1, terms, columns) for part in (values, informed))
+        information = np.einsum("lti,ltj->tij", *parts)
         return square, int(acting.sum()) // 3, information, score.reshape(terms, columns), cross
 
     def _left(self, screened: Screen) -> tuple[ndarray, ndarray]:
@@ -231,15 +233,20 @@ def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, nd
 
 
 def _hats(terms: Sequence[Term], places: Mapping[str, ndarray], values: KnotValues) -> ndarray:
-    """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m)."""
+    """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m).
+
+    ``terms``: of every scalar with every vector."""
     number = np.arange(PIECES)
-    columns = []
-    for term in terms:
-        scalar, vector = term.parts
-        place = np.interp(scalar.read(values), places[term.factors[0]], number)
-        hats = np.maximum(1.0 - np.abs(place[:, None] - number), 0.0)
-        columns.append(vector.read(values)[:, :, None] * hats[:, None])
-    return np.stack(columns, axis=2)
+    vectors = VECTORS[terms[0].block]
+    names = dict.fromkeys(term.vector for term in terms)
+    directions = np.stack([vectors[name].read(values) for name in names], axis=-1)
+    hats = []
+    for (name,) in dict.fromkeys(term.factors for term in terms):
+        place = np.interp(SCALARS[name].read(values), places[name], number)
+        hats.append(np.maximum(1.0 - np.abs(place[:, None] - number), 0.0))
+    of_scalars = np.stack(hats, axis=1)
+    every = of_scalars[:, None, :, None] * directions[:, :, None, :, None]
+    return every.reshape(len(directions), 3, len(terms), PIECES)
 
 
 def best_curves(

@@ -282,7 +282,8 @@ def following(
     weight = sensitive / np.hypot(flights.sigma[w], drift(flights, w))
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight[:, None]
-    shift = by_state.T @ (weight * (window.effects[:samples] @ change))
+    changed = np.flatnonzero(change)
+    shift = by_state.T @ (weight * (window.effects[:samples, changed] @ change[changed]))
     information = by_state.T @ by_state + np.eye(len(sd))
     moves = np.zeros(len(free))
     moves[free] = -sd * np.linalg.solve(information, shift)

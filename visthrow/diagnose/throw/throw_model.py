@@ -16,7 +16,6 @@ from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
@@ -296,14 +295,10 @@ class ThrowModel(Model):
         ways = directions(setting.plant)
         present = deviations(ways, self.flights.cuts) > 0.0
         follows = np.array([x.follows for x in ways])
-
-        def move(w: int, window: Window) -> ndarray:
-            return following(self.flights, w, window, follows[present[w]], change)
-
         numbers = self._retained[list(linearised.windows)]
         sizes = np.zeros(present.shape)
-        for w, size in zip(numbers, parallel_map(move, numbers, linearised.windows.values())):
-            sizes[w, present[w]] = size
+        for w, window in zip(numbers, linearised.windows.values()):
+            sizes[w, present[w]] = following(self.flights, w, window, follows[present[w]], change)
         begun = self._settled_at[_key(linearised.theta)]
         moved = sizes + begun[MOVED]
         moves = [moved[w, present[w]] for w in numbers]
