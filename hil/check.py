@@ -49,7 +49,7 @@ def check(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock]]:
+def _open_all(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock]]:
     """Source, the autopilot's link, and the clock."""
     with tempfile.TemporaryDirectory() as folder:
         opened = open_source(params, Path(folder), MonotonicClock(args.speed), key_of(args))
@@ -64,7 +64,7 @@ def _hand_carry(args: argparse.Namespace) -> int:
     params = dataclasses.replace(
         params, source=dataclasses.replace(params.source, check_units=False)
     )
-    with _opened(params, args) as (source, _, clock):
+    with _open_all(params, args) as (source, _, clock):
         recorded = isinstance(clock, ManualClock)
         steps = handcarry.collect(
             source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded
@@ -81,7 +81,7 @@ def _listen(args: argparse.Namespace) -> int:
     """
     params = params_of(args)
     waiting = dataclasses.replace(params.states, idle=FOR_EVER, check=FOR_EVER, check_hold=FOR_EVER)
-    with _opened(params, args) as (source, link, clock):
+    with _open_all(params, args) as (source, link, clock):
         runner = Runner(
             dataclasses.replace(params, states=waiting),
             Policy.load(find_policy(params.policy)),

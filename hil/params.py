@@ -152,7 +152,7 @@ class HilParams(Bounded):
                 f"frames of {', '.join(self.frames)}; expected vehicle and payload, goal if it"
                 " moves"
             )
-        for wrong, text in (*self._missing_parts(), *self._misplaced()):
+        for wrong, text in (*self._missing_parts(), *self._place_rules()):
             if wrong:
                 raise ConfigError(text)
         angles = {channel.name for channel in self.source.columns if channel.kind == "euler"}
@@ -202,7 +202,7 @@ class HilParams(Bounded):
             ),
         )
 
-    def _misplaced(self) -> tuple[tuple[bool, str], ...]:
+    def _place_rules(self) -> tuple[tuple[bool, str], ...]:
         """Return rules on places and fences: whether each is broken, and its error."""
         fence = self.fence
         low = self.fence.payload_low

@@ -194,7 +194,7 @@ class Machine:
             texts.append("the operator's word: arm")
         return "; ".join(texts)
 
-    def _lasted(self, time: float, holds: bool, duration: float) -> bool:
+    def _has_lasted(self, time: float, holds: bool, duration: float) -> bool:
         """Return whether a condition has held for a time [s]."""
         if not holds:
             self._lasting_since = None
@@ -220,7 +220,7 @@ class Machine:
 
     def _check(self, time: float, inputs: Inputs) -> None:
         good = not (inputs.missing() or inputs.failed_checks or inputs.streams)
-        if self._lasted(time, good, self.params.check_hold):
+        if self._has_lasted(time, good, self.params.check_hold):
             self._go(time, State.READY, "checks passed")
         elif self._late(time) and not self.patient:
             reason = self.waits(inputs) or "poses or autopilot come and go"
@@ -242,7 +242,7 @@ class Machine:
             reason = "disarmed: stale poses, not followed, or the recording failed"
             self._go(time, State.READY, reason)
             return
-        calm = self._lasted(time, inputs.calm and not inputs.failed_checks, self.params.quiet)
+        calm = self._has_lasted(time, inputs.calm and not inputs.failed_checks, self.params.quiet)
         self.ready_to_throw = calm and time - self.since >= self.params.armed_least
         if inputs.agreed == THROW or (self.ready_to_throw and inputs.agreed is None):
             self._go(time, State.THROW, "calm")
@@ -270,7 +270,7 @@ class Machine:
             self.left_fence = inputs.fence
             self._go(time, State.LAND, f"after the throw, fence: {inputs.fence}")
         # A stale pose never moves: that says nothing about the vehicle.
-        elif self._lasted(time, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
+        elif self._has_lasted(time, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
             state = State.READY if self.throws < self.max_throws else State.LAND
             self._go(time, state, "hovering again")
         elif inputs.land or self._late(time):

@@ -177,12 +177,12 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     if message.frame_id not in LOCAL_FRAMES:
         return None
     quat = tuple(message.q)
-    vel = _known((message.vx, message.vy, message.vz))
+    vel = _known_or_none((message.vx, message.vy, message.vz))
     if vel is not None and message.child_frame_id in BODY_FRAMES:
         vel = rotate_one((*quat[1:], quat[0]), vel) if has_attitude(quat) else None
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
-    rate = _known((message.rollspeed, message.pitchspeed, message.yawspeed))
+    rate = _known_or_none((message.rollspeed, message.pitchspeed, message.yawspeed))
     return Pose(
         message.time_usec / 1e6,
         arrival,
@@ -196,7 +196,7 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     )
 
 
-def _known(vector: Vector) -> Vector | None:
+def _known_or_none(vector: Vector) -> Vector | None:
     """Return a vector; None for NaN, which MAVLink writes for a quantity that is not known."""
     return None if any(math.isnan(x) for x in vector) else vector
 

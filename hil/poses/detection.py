@@ -104,7 +104,7 @@ class Detections:
         frame = detection.frame_detections()
         rot_wb = matrix_of_quat(np.array(quat))
         if self._turn is not None and self._path:
-            frame = self._carried(frame, detection.stamp - self._latency + aged)
+            frame = self._carry(frame, detection.stamp - self._latency + aged)
         points, valid = convert_to_training_keypoints(self._camera, frame, rot_wb)
         self.fresh = detection.stamp, points.numpy(), valid.numpy()
         if detection.stamp <= self._newest:
@@ -126,7 +126,7 @@ class Detections:
             if time - stamp > self._hold
         ]
 
-    def _carried(self, detections: FrameDetections, when: float) -> FrameDetections:
+    def _carry(self, detections: FrameDetections, when: float) -> FrameDetections:
         """Return what was seen at a time as the camera of training would see it now: the goal lies,
         the ball goes with the vehicle.
         """
@@ -140,18 +140,18 @@ class Detections:
         ball = detections.ball
         goal = detections.goal
         if ball is not None:
-            ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._to_scale(ball.ray_c[None])[0]
+            ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._rescale(ball.ray_c[None])[0]
             ball = BallSeen(ray, ball.half_angle / (1.0 + self._scale), ball.score)
         if goal is not None:
             eye = pos + rot @ lens
-            rays_w = self._to_scale(goal.rays_c) @ (rot @ rot_bc @ turn).T
+            rays_w = self._rescale(goal.rays_c) @ (rot @ rot_bc @ turn).T
             reach = eye[2] / np.maximum(-rays_w[:, 2:], 0.05)
             from_now = eye + reach * rays_w - (pos_now + rot_now @ lens)
             rays = from_now @ (rot_now @ rot_bc)
             goal = GoalSeen(rays / np.linalg.norm(rays, axis=1, keepdims=True), goal.score)
         return FrameDetections(ball, goal)
 
-    def _to_scale(self, rays_c: np.ndarray) -> np.ndarray:
+    def _rescale(self, rays_c: np.ndarray) -> np.ndarray:
         """Return rays, shape (N, 3), by the focal length that was found."""
         lens = self._camera.fisheye
         points, _ = lens.project_normalized(torch.from_numpy(np.ascontiguousarray(rays_c)))

@@ -39,9 +39,9 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
     """
     path, ending = Path(path), Path(path).suffix.lower()
     if path.is_dir() and not (path / BAG).is_file():
-        return _of_folder(path)
+        return _read_folder(path)
     if not path.exists():
-        return _named(path, mapping)
+        return _read_named(path, mapping)
     if ending == ".npz":
         log = FlightLog.load(path)
         log.meta.setdefault("source", str(path))
@@ -54,7 +54,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         from visthrow.logs.readers.autopilot_logs import log_of_autopilot
 
         return [log_of_autopilot(path)]
-    return _of_table(path, mapping)
+    return _read_table(path, mapping)
 
 
 def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> list[FlightLog]:
@@ -74,7 +74,7 @@ def takes_mapping(path: str | Path) -> bool:
     )
 
 
-def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
+def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     """Read what names no file, but logs of one flight joined by ``+``, or parts of a file behind a
     colon.
     """
@@ -109,7 +109,7 @@ def _missing(path: Path) -> LogError:
     return LogError(f"{path}: {actual}; in that folder: {', '.join(siblings[:20]) or 'nothing'}")
 
 
-def _of_folder(path: Path) -> list[FlightLog]:
+def _read_folder(path: Path) -> list[FlightLog]:
     if (path / RUN_LOG).is_file():
         return read(path / RUN_LOG)
     logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
@@ -162,7 +162,7 @@ def _is_text(path: Path) -> bool:
         return b"\0" not in file.read(4096)
 
 
-def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
+def _read_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
     from visthrow.logs.readers import table
     from visthrow.logs.readers.blackbox import channels
 

@@ -106,14 +106,14 @@ def _velocity(log: FlightLog) -> Samples | None:
 def _force(log: FlightLog) -> Samples | None:
     """Size of the specific force: the accelerometer's axes turn in the world."""
     if "acc_b" in log:
-        return _sized(*log["acc_b"].samples())
+        return _magnitude(*log["acc_b"].samples())
     if "pos_w" not in log:
         return None
     time, acc = log["pos_w"].samples().derivative().derivative()
-    return _sized(time, acc + [0.0, 0.0, GRAVITY])
+    return _magnitude(time, acc + [0.0, 0.0, GRAVITY])
 
 
-def _sized(time: np.ndarray, values: np.ndarray) -> Samples:
+def _magnitude(time: np.ndarray, values: np.ndarray) -> Samples:
     return Samples(time, np.linalg.norm(values, axis=1, keepdims=True))
 
 
@@ -122,7 +122,7 @@ def _lag(a: Samples, b: Samples) -> tuple[float, float]:
 
     All lags at once by Fourier transform of the sizes; about the best one by one, the components in
     the axes that fit best."""
-    sizes = _sized(*a), _sized(*b)
+    sizes = _magnitude(*a), _magnitude(*b)
     grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in sizes]
     x, y = (
         np.interp(grid, time, size[:, 0]) - np.mean(size)
@@ -131,10 +131,10 @@ def _lag(a: Samples, b: Samples) -> tuple[float, float]:
     lags = correlation_lags(len(x), len(y))
     coarse = grids[0][0] - grids[1][0] + int(lags[np.argmax(correlate(x, y, method="fft"))]) / RATE
     candidates = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
-    scores = np.array([_alignment(*_on_common_grid(a, b, offset)) for offset in candidates])
+    scores = np.array([_alignment(*_resample_both(a, b, offset)) for offset in candidates])
     best = int(np.argmax(scores))
     offset = float(candidates[best] + _STEP * _vertex(scores, best))
-    pairs = _on_common_grid(*sizes, offset)
+    pairs = _resample_both(*sizes, offset)
     return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
 
 
@@ -149,7 +149,7 @@ def _vertex(scores: np.ndarray, index: int) -> float:
     return 0.5 * (upper - lower) / curve if curve > 0.0 else 0.0
 
 
-def _on_common_grid(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, np.ndarray]:
+def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, np.ndarray]:
     """Values of both on a grid of the first's clock, the same for any offset, where
     there are both.
     """

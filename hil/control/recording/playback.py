@@ -113,7 +113,7 @@ def replay(folder: str | Path) -> dict[str, Any]:
             value = list(value) if isinstance(value, tuple) else value
             if was != value:
                 differences.append((line["n"], name, was, value))
-    cut = _cut(folder, len(ticks))
+    cut = _describe_missing(folder, len(ticks))
     return {
         "ticks": len(ticks),
         "actions": sum(decision.action is not None for decision, _ in flown),
@@ -123,7 +123,7 @@ def replay(folder: str | Path) -> dict[str, Any]:
     }
 
 
-def _cut(folder: str | Path, ticks: int) -> str | None:
+def _describe_missing(folder: str | Path, ticks: int) -> str | None:
     """Return what is missing of a recording, in words."""
     try:
         flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]

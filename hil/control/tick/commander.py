@@ -84,7 +84,7 @@ class Commander:
         parts = self.parts
         state = record.state
         record.ready = THROW if parts.machine.ready_to_throw else NOTHING
-        command = self._wanted_command(estimate, status, record)
+        command = self._choose_command(estimate, status, record)
         if parts.calibrating is not None:
             command = self._add_sway(estimate, status, command, record)
         hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW
@@ -95,7 +95,7 @@ class Commander:
         observes = parts.params.observe and record.action is None
         if observes and estimate.is_complete and estimate.vehicle.quat:
             self._run_policy(estimate, record)
-        record.command = self._guarded(command if self._is_ours(state, status) else None, record)
+        record.command = self._guard(command if self._is_ours(state, status) else None, record)
         if record.command is not None:
             ready = perf_counter()
             parts.backend.send(record.command, record.time)
@@ -143,7 +143,7 @@ class Commander:
         if state in (State.LAND, State.ABORT) and estimate.vehicle is not None:
             parts.hovering.hold(estimate.vehicle.pos)
 
-    def _wanted_command(
+    def _choose_command(
         self, estimate: Estimate, status: Status, record: TickRecord
     ) -> Command | None:
         """Return the command of a state, before the guard; None for none."""
@@ -280,7 +280,7 @@ class Commander:
             return False
         return state != State.ABORT or (status.connected and self.parts.machine.flown)
 
-    def _guarded(self, command: Command | None, record: TickRecord) -> Command | None:
+    def _guard(self, command: Command | None, record: TickRecord) -> Command | None:
         """Return a command within its limits; one that is not finite ends the run."""
         if command is None:
             self.guard.reset()

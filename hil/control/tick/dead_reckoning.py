@@ -45,10 +45,10 @@ class DeadReckoning:
             self._time = time
             self.duration += step
             new_rates = rates if rates != reported else None
-            self.state = _advanced(self.state, step, new_rates, command, mass)
+            self.state = _advance(self.state, step, new_rates, command, mass)
 
 
-def _advanced(
+def _advance(
     state: BodyState, step: float, rates: tuple[float, ...] | None, command: Command, mass: float
 ) -> BodyState:
     """Return a state after a step [s]; without new rates, they follow the command."""

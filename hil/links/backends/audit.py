@@ -71,16 +71,16 @@ def rules_of(firmware: str, params: Any, **further: Any) -> list[Rule]:
     for row in RULES[firmware]:
         conditions = row.get("when", {})
         if all(required in (terms[k], bool(terms[k])) for k, required in conditions.items()):
-            fields = {key: _filled(key, entry, terms) for key, entry in row.items()}
+            fields = {key: _fill(key, entry, terms) for key, entry in row.items()}
             fields.pop("when", None)
             rules.append(Rule(**fields))
     return rules
 
 
-def _filled(key: str, entry: Any, terms: dict[str, Any]) -> Any:
+def _fill(key: str, entry: Any, terms: dict[str, Any]) -> Any:
     """Return an entry of a row with the terms that it names."""
     if isinstance(entry, list):
-        return tuple(_filled(key, value, terms) for value in entry)
+        return tuple(_fill(key, value, terms) for value in entry)
     if isinstance(entry, str):
         return entry.format(**terms) if key in ("name", "why", "expected") else terms[entry]
     return entry

@@ -137,11 +137,11 @@ class Crazyflie(OnPort):
             thrust = 0.0
             rates = [0.0, 0.0, 0.0]
         share = self.params.thrust.share(thrust)
-        rates[2] = self._moved_yaw(rates[2], host_time)
+        rates[2] = self._update_yaw(rates[2], host_time)
         x, y, z = (math.degrees(rate) for rate in rates)
         return self._put(crtp.manual(round(FACTS["manual_thrust"] * share), (x, y, z)))
 
-    def _moved_yaw(self, rate: float, host_time: float) -> float:
+    def _update_yaw(self, rate: float, host_time: float) -> float:
         """Return the yaw rate to send for one that is wanted [rad/s].
 
         A yaw rate moves the yaw that is held, and the error of that makes the vehicle turn: in a

@@ -69,7 +69,7 @@ class Strangers:
                 self._known.add(name)
                 self._guard(int(link.name))
         before = self._count
-        self._count = sum(map(_dropped, self._guarded))
+        self._count = sum(map(_count_dropped, self._guarded))
         return self._count - before
 
     def _guard(self, number: int) -> None:
@@ -81,7 +81,7 @@ class Strangers:
             bodies.close()
 
 
-def _dropped(sock: socket.socket) -> int:
+def _count_dropped(sock: socket.socket) -> int:
     """Return the datagrams that the kernel has not handed to a socket."""
     memory = sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (DROPS + 1))
     return struct.unpack_from("I", memory, 4 * DROPS)[0]

@@ -72,7 +72,7 @@ class MavlinkDecoder:
             if ids.message == kind and ids.system == sender[0] and ids.component in (0, sender[1]):
                 paired = kind == "LOCAL_POSITION_NED"
                 pose = (
-                    self._paired(message, sender, ids.body, arrival)
+                    self._pair(message, sender, ids.body, arrival)
                     if paired
                     else pose_from_message(message, ids.body, arrival)
                 )
@@ -88,7 +88,7 @@ class MavlinkDecoder:
         accepted = " or ".join(map(frame_name, LOCAL_FRAMES))
         return f"frame {frame_name(message.frame_id)} is not taken; expected {accepted}"
 
-    def _paired(
+    def _pair(
         self, message: Any, sender: tuple[int, int], body: str, arrival: float
     ) -> Pose | None:
         attitude = self._attitudes.get(sender)

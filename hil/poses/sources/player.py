@@ -46,7 +46,7 @@ class LogBody(Bounded):
 
 
 @contextmanager
-def _as_source() -> Iterator[None]:
+def _convert_errors() -> Iterator[None]:
     """Raise a reader's `LogError` as `SourceError`."""
     try:
         yield
@@ -54,7 +54,7 @@ def _as_source() -> Iterator[None]:
         raise SourceError(str(error)) from error
 
 
-@_as_source()
+@_convert_errors()
 def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
     """Return poses of a table, or of any file that ``visthrow.logs`` reads, arrivals as the stamps,
     counted from the first; raises `SourceError` where it cannot be read, lacks a column, or holds
@@ -63,7 +63,7 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
     logs = read(path, mapping)
     if len(logs) > 1:
         raise LogError(f"{path}: {len(logs)} flights in one file; expected one, named as FILE:PART")
-    poses = [pose for body in BODIES for pose in _of_channels(logs[0], body)]
+    poses = [pose for body in BODIES for pose in _poses_of_channels(logs[0], body)]
     if not poses:
         positions = ", ".join(names[0] for names in CHANNELS.values())
         raise LogError(
@@ -73,7 +73,7 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
     return poses
 
 
-def _of_channels(log: FlightLog, body: str) -> list[Pose]:
+def _poses_of_channels(log: FlightLog, body: str) -> list[Pose]:
     """Return poses of one body; of a sample that is not valid the numbers are NaN."""
     position = CHANNELS[body][0]
     if position not in log or not len(log[position].time):
@@ -110,7 +110,7 @@ def _latest(times: np.ndarray, stamps: np.ndarray, age: float) -> np.ndarray:
     return np.where((index >= 0) & (stamps - times[np.maximum(index, 0)] <= age), index, -1)
 
 
-@_as_source()
+@_convert_errors()
 def read_tlog(
     path: str | Path, bodies: tuple[BodyIds, ...], roster: Roster | None = None
 ) -> list[Pose]:
@@ -131,7 +131,7 @@ def read_tlog(
     return poses
 
 
-@_as_source()
+@_convert_errors()
 def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> list[Pose]:
     """Return poses of all bodies in a log of kind "bin" or "ulg", arrivals counted from the first;
     raises `SourceError` for no such file, a missing package, or a message that carries no pose or
@@ -151,7 +151,7 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
             )
         file = body.file or path
         log = log_of_poses(file, kind, body.message, body.instance)
-        body_poses = [_of_vehicle(pose, body) for pose in _of_channels(log, VEHICLE)]
+        body_poses = [_pose_of_vehicle(pose, body) for pose in _poses_of_channels(log, VEHICLE)]
         if "quat_wb" not in log.meta.get("together", ()):
             body_poses = [pose for pose in body_poses if pose.quat is not None]
         if not body_poses:
@@ -164,7 +164,7 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
     return [replace(pose, arrival=pose.arrival - start) for pose in poses]
 
 
-def _of_vehicle(pose: Pose, body: LogBody) -> Pose:
+def _pose_of_vehicle(pose: Pose, body: LogBody) -> Pose:
     """Return a pose of an autopilot's own vehicle as one of a body, its quaternion wxyz."""
     quat = None if pose.quat is None else (pose.quat[3], *pose.quat[:3])
     return replace(pose, body=body.body, quat=quat, arrival=pose.arrival + body.time_offset)

@@ -241,7 +241,7 @@ class CommandLine:
         """Connect and enter it. Raises `RunError`: nobody answers."""
         self._socket = socket.create_connection(("127.0.0.1", PORTS[0]), timeout=ANSWER)
         self._socket.sendall(b"#")
-        self._heard()
+        self._read_until()
 
     def __enter__(self) -> "CommandLine":
         return self
@@ -249,7 +249,7 @@ class CommandLine:
     def __exit__(self, *_: object) -> None:
         self._socket.close()
 
-    def _heard(self, last: bytes = PROMPT) -> str:
+    def _read_until(self, last: bytes = PROMPT) -> str:
         """Return the output up to the next prompt, or to other last words."""
         data = b""
         end = time.monotonic() + ANSWER
@@ -270,7 +270,7 @@ class CommandLine:
     def ask(self, text: str) -> str:
         """Give a command; what it says. Raises `RunError`: it is refused."""
         self._socket.sendall(text.encode() + b"\n")
-        answer = self._heard()
+        answer = self._read_until()
         if "###ERROR" in answer:
             raise RunError(
                 f"the firmware refuses {text!r}: {answer[answer.index('###') :].splitlines()[0]}"
@@ -293,7 +293,7 @@ class CommandLine:
         Raises `RunError`: it does not.
         """
         self._socket.sendall(b"save\n")
-        self._heard(b"Rebooting")
+        self._read_until(b"Rebooting")
 
 
 def _end_with_parent() -> None:

@@ -161,7 +161,7 @@ class HangingBall:
         before = self._ball
         self._vel = self._vel - [0.0, 0.0, STEP * GRAVITY]
         if self.attached:
-            self._vel = self._damped(self._vel - self._now.vel) + self._now.vel
+            self._vel = self._damp(self._vel - self._now.vel) + self._now.vel
         self._ball = before + STEP * self._vel
         if self.attached:
             off = self._ball - mount
@@ -178,7 +178,7 @@ class HangingBall:
                 "landing_time": time - (1.0 - share) * STEP,
             }
 
-    def _damped(self, vel: np.ndarray) -> np.ndarray:
+    def _damp(self, vel: np.ndarray) -> np.ndarray:
         """Return a velocity relative to the vehicle after a step of damping."""
         speed = float(np.linalg.norm(vel))
         loss = min(2.0 * math.log(2.0) / HALVING * speed, MOST_DAMPING)

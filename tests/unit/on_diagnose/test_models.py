@@ -303,10 +303,10 @@ class TestFlyer:
         wind, tilt, gain = (
             frozenset({named[n]}) for n in ("wind_x", "frame_tilt_y", "thrust_gain")
         )
-        selector.best = selector._tried(selector.nominal, [wind])[0]
+        selector.best = selector._try(selector.nominal, [wind])[0]
         listed = {tilt: -9.0, gain: -9.0}
         tried = {gain | {c}: -1.0 for c in selector.candidates[:4]}
-        assert selector._next(listed, tried, -np.inf) == tilt
+        assert selector._choose_next(listed, tried, -np.inf) == tilt
 
     def test_a_flight_whose_thrust_differs_says_what_and_by_how_much(self):
         logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]

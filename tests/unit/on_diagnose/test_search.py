@@ -450,9 +450,9 @@ def test_a_name_of_which_the_true_cause_leaves_nothing_is_dropped(monkeypatch):
     by_name = {c.name: c for c in selector.candidates}
     stand_in = frozenset({by_name["effect_08"]})
     true = frozenset({by_name["effect_06"]})
-    (begin,) = selector._tried(selector.nominal, [stand_in])
+    (begin,) = selector._try(selector.nominal, [stand_in])
     selector._go(begin)
-    monkeypatch.setattr(selector, "_listed", lambda: {stand_in | true: 40.0})
+    monkeypatch.setattr(selector, "_list_sets", lambda: {stand_in | true: 40.0})
     assert selector._moved()
     assert selector.best.chosen == true
 

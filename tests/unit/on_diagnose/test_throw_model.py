@@ -486,6 +486,6 @@ def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():
     problem = Problem.of(model, windows, range(len(windows)))
     selector = Selector(linearise(problem, np.zeros(len(names))), 5.0, laws=False)
     named = {c.name: frozenset({c}) for c in selector.candidates}
-    selector.best = selector._tried(selector.nominal, [named["wind_x"]])[0]
+    selector.best = selector._try(selector.nominal, [named["wind_x"]])[0]
     assert selector._limit(named["frame_tilt_y"]) > 2.0 * STRONG
     assert selector._limit(named["com_x"]) == STRONG

@@ -257,7 +257,7 @@ def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch)
         laws=True,
         threshold=5.0,
     )
-    monkeypatch.setattr(verdicts, "_by_block", lambda _: {block: [1] for block in curves})
+    monkeypatch.setattr(verdicts, "_list_by_block", lambda _: {block: [1] for block in curves})
     monkeypatch.setattr(terms, "strongest_forces", lambda _: dict.fromkeys(curves, 1.0))
     monkeypatch.setattr(terms, "best_curves", lambda *_: curves)
     monkeypatch.setattr(verdicts, "_parts_of", lambda *_: {1})

@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )
-    name = _made_with(saved, getattr(args, option), option, folder)
-    base = _named(folder, name)
+    name = _plant_of_report(saved, getattr(args, option), option, folder)
+    base = _path_from(folder, name)
     diagnosed = config.load(
         schema, config.find(folder, name), saved.report.get("overrides", ()) if of_throw else ()
     )
@@ -87,7 +87,7 @@ def _apply_firmware(args: argparse.Namespace) -> int:
             " --hover 0.36"
         )
     plant = args.plant or DEFAULT_PLANT
-    base = _named("train", plant)
+    base = _path_from("train", plant)
     experiment = load_experiment(plant)
     text = patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
     atomic_write(args.out, text)
@@ -96,7 +96,9 @@ def _apply_firmware(args: argparse.Namespace) -> int:
     return 0
 
 
-def _made_with(saved: "SavedDiagnosis", requested: str | None, option: str, folder: str) -> str:
+def _plant_of_report(
+    saved: "SavedDiagnosis", requested: str | None, option: str, folder: str
+) -> str:
     """Name of the plant or config that was diagnosed: sizes are counted from there.
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
@@ -107,7 +109,7 @@ def _made_with(saved: "SavedDiagnosis", requested: str | None, option: str, fold
             f"{saved.path}: a diagnosis of the model '{saved.model}' names no {option}; expected"
             f" --{option} NAME"
         )
-    if recorded and requested and _named(folder, recorded) != _named(folder, requested):
+    if recorded and requested and _path_from(folder, recorded) != _path_from(folder, requested):
         raise DiagnoseError(
             f"{saved.path}: made with --{option} {recorded}; its sizes do not count from "
             f"{requested}"
@@ -115,7 +117,7 @@ def _made_with(saved: "SavedDiagnosis", requested: str | None, option: str, fold
     return recorded or requested
 
 
-def _named(folder: str, name: str) -> str:
+def _path_from(folder: str, name: str) -> str:
     """Path under which another configuration finds one."""
     path = config.find(folder, name)
     shipped = path.is_relative_to(config.configs_root())

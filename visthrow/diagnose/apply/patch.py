@@ -101,7 +101,7 @@ def text(
         for key in effect.changes:
             words[key.path.removeprefix("plant.")].append(size)
     switched = [e.name for e in effects if e.switch]
-    lines = _head(base, provenance) + _commented(changed, words, switched)
+    lines = _head(base, provenance) + _add_comments(changed, words, switched)
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -110,7 +110,7 @@ def _head(base: str, comments: Sequence[str]) -> list[str]:
     return [*(f"# {line}" for line in comments), dumps({"base": base}).strip(), ""]
 
 
-def _commented(
+def _add_comments(
     changed: Mapping[str, Any], words: Mapping[str, Sequence[str]], others: Sequence[str] = ()
 ) -> list[str]:
     """Return the lines of what changes with comments: words by the path of an entry, ``others`` on
@@ -213,7 +213,7 @@ def of_setup(
         changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}
     for (name, size), sd in zip(theta.items(), np.sqrt(np.diag(covariance))):
         words[f"effects.{name}"] = [f"{size:+.4g} +- {sd:.2g} {effects[name].unit}"]
-    return "\n".join([*_head(base, comments), *_commented(changed, words)]) + "\n"
+    return "\n".join([*_head(base, comments), *_add_comments(changed, words)]) + "\n"
 
 
 def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:

@@ -118,15 +118,15 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     the setup's model is of no vehicle."""
     size = defaultdict(float, zip(result.names, map(float, result.theta)))
     if setup.flyer is not None:
-        return _of_flyer(setup.flyer, size, base)
+        return _fit_flyer(setup.flyer, size, base)
     if setup.stand is not None:
-        return _of_stand(setup.stand, size, result.middle_speed, base)
+        return _fit_stand(setup.stand, size, result.middle_speed, base)
     raise DiagnoseError(
         f"'{setup.about}' is neither a vehicle nor a motor; use a setup with [flyer] or [stand]"
     )
 
 
-def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
+def _fit_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
     gain = 1.0 + size["thrust_gain"]
     mass = p.mass + size["mass_quad"]
     drag_xy = p.drag_xy + size["rotor_drag_xy"]
@@ -157,7 +157,7 @@ def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicle
     return changed(base, values)
 
 
-def _of_stand(
+def _fit_stand(
     p: Any, size: Mapping[str, float], middle: float, base: VehicleParams
 ) -> VehicleParams:
     values = {

@@ -67,7 +67,7 @@ def propose(
             " are they?"
         )
         return proposal
-    log = _corrected(table, source, proposal)
+    log = _correct(table, source, proposal)
     corrected = proposal.mapping
     _judge_thrust(log, proposal, mass)
     if proposal.mapping is not corrected:
@@ -159,7 +159,7 @@ def _clock(
     return TimeColumn(name, unit), numbers[name] * seconds
 
 
-def _corrected(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
+def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
     """Read the table by the proposal, hold it against physics, and turn rates whose axes another
     set explains; the rest is asked about. Returns the log of channels that hold enough.
     """
@@ -193,7 +193,7 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     Raises LogError: in grams the mass fits, in kilograms it does not.
     """
     entry = proposal.mapping.entry("thrust_command")
-    carried = _carried(log)
+    carried = _carried_mass(log)
     heavy = weighed is not None and weighed >= 1e3 * LIGHTEST  # a number of grams, perhaps
     if entry is None or carried is None:
         if heavy:
@@ -258,7 +258,7 @@ def _doubt_of_mass(off: float, hangs: bool) -> str:
     return ""
 
 
-def _carried(log: FlightLog) -> float | None:
+def _carried_mass(log: FlightLog) -> float | None:
     """Return the mass that a thrust in newtons carries, by the accelerometer or at the usual thrust
     of the flight [kg]; None without a thrust.
     """

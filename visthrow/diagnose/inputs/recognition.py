@@ -100,7 +100,7 @@ class Recognition:
     def channels(self) -> list[ChannelMap]:
         """Recognise what can be, the vehicle's attitude and path first."""
         self._quaternions()
-        self._other_attitudes()
+        self._find_other_attitudes()
         self._positions()
         self._velocities()
         self._rates()
@@ -155,11 +155,11 @@ class Recognition:
             elif name in self._entries and group.matches("estimate"):
                 name = "est_quat_wb"
             largest = np.argmax(np.nanmean(np.abs(group.values), axis=0))
-            order = "xyzw" if _lettered(group) or largest == 3 else "wxyz"
+            order = "xyzw" if _has_letters(group) or largest == 3 else "wxyz"
             why = "four columns of length 1"
             self._take(name, group, "1", why, kind="quaternion", order=order)
 
-    def _other_attitudes(self) -> None:
+    def _find_other_attitudes(self) -> None:
         """Attitudes as rotation matrices, rotation vectors or angles."""
         for group in self._open(9):
             if group.matches("rotation") and not group.matches("not_vehicle"):
@@ -186,7 +186,7 @@ class Recognition:
         group = self._sources["quat_wb"]
         motive = "Format Version" in self.settings
         open_unit = entry.kind == "euler" and not group.unit and entry.unit == "rad"
-        open_order = entry.kind == "quaternion" and not _lettered(group)
+        open_order = entry.kind == "quaternion" and not _has_letters(group)
         units = ("rad", "deg") if open_unit else (entry.unit,)
         orders = ("wxyz", "xyzw") if open_order else (entry.order,)
         worlds = ("", Y_UP if self.settings else NED)
@@ -227,7 +227,7 @@ class Recognition:
             listed = "; ".join(group.listed for group in groups)
             self.questions.append(f"are these positions? Names do not say: {listed}")
         slopes = groups + [g for g in smooth if g.hints_at("velocity")]
-        groups = self._without_derivatives(groups, slopes)
+        groups = self._drop_derivatives(groups, slopes)
         for group in [g for g in groups if g.matches("camera")]:
             unit = readings(self.time, group.values, _lengths(group), [None])[0].unit
             why = "three columns that move smoothly; their name speaks of a camera"
@@ -352,16 +352,16 @@ class Recognition:
         step = np.max(np.std(np.diff(values, axis=0), axis=0))
         return bool(width > 0.0 and step < 0.3 * width)
 
-    def _without_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
+    def _drop_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
         """Return the groups that are no derivative of another path; of captures with many markers
         all pairs are compared in one product.
         """
         grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
         if not groups or len(grid) < 25:
             return groups
-        laid = {g.columns: _on_grid(self._samples(g), grid) for g in groups + paths}
-        slopes = [_normalised(np.gradient(laid[path.columns], axis=0)) for path in paths]
-        values = [_normalised(laid[group.columns]) for group in groups]
+        laid = {g.columns: _interpolate(self._samples(g), grid) for g in groups + paths}
+        slopes = [_normalise(np.gradient(laid[path.columns], axis=0)) for path in paths]
+        values = [_normalise(laid[group.columns]) for group in groups]
         firm = np.array(slopes) @ np.array(values).T > _FIRMLY
         return [
             group
@@ -559,18 +559,18 @@ def _angle_unit(group: Group) -> str:
     return "deg" if group.reach > _TURN else "rad"
 
 
-def _lettered(group: Group) -> bool:
+def _has_letters(group: Group) -> bool:
     """Whether the names of a quaternion's columns say which is w."""
     return any("w" in split_unit(column)[0].lower()[-3:] for column in group.columns)
 
 
-def _normalised(values: np.ndarray) -> np.ndarray:
+def _normalise(values: np.ndarray) -> np.ndarray:
     """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
     centred = (values - np.mean(values, axis=0)).ravel()
     return centred / max(np.linalg.norm(centred), 1e-300)
 
 
-def _on_grid(samples: Samples, grid: np.ndarray) -> np.ndarray:
+def _interpolate(samples: Samples, grid: np.ndarray) -> np.ndarray:
     """Return a group's values at times of a grid, zeros where too few are known."""
     if len(samples.time) < 100:
         return np.zeros((len(grid), 3))

@@ -110,7 +110,7 @@ def readings(
     in_hall = fitting_units(reach, units, *_HALL)
     fall = by_fall(time, path)
     attitudes = list(attitudes)
-    leans = [NO_LEAN if way is None else _by_lean(time, path, way) for way in attitudes]
+    leans = [NO_LEAN if way is None else _weigh_by_lean(time, path, way) for way in attitudes]
     together: dict[tuple[str, str] | None, float] = {}  # angles in whatever unit
     kinds = [way.kind if way is not None else None for way in attitudes]
     for kind, lean in zip(kinds, leans):
@@ -142,7 +142,7 @@ def readings(
     return sorted(listed, key=lambda reading: reading.doubt)
 
 
-def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> Lean:
+def _weigh_by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> Lean:
     """Weigh a path against the lean that an attitude gives it."""
     attitudes = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)

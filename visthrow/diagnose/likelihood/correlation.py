@@ -98,10 +98,10 @@ def with_correlations(
     ``windows``: with white noise; ``correlations_of``: of channels, by number."""
     if not correlations_of:
         return list(windows)
-    return parallel_map(partial(_with_correlation, correlations_of=correlations_of), windows)
+    return parallel_map(partial(_add_correlation, correlations_of=correlations_of), windows)
 
 
-def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
+def _add_correlation(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
     factors = []
     sigma = window.sigma.copy()
     for channel, correlation in correlations_of.items():
@@ -122,13 +122,13 @@ def correlations(
 
     ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the
     model's channels. Returns channel -> its noise, where that is surely not white."""
-    free = [_with_free_effects(window, slabs) for window in few_of(windows)]
+    free = [_free_effects(window, slabs) for window in few_of(windows)]
     bare = parallel_map(partial(hidden_gram, channels=channels), free)
     fits = noise.widely_fitted(free, bare)
     residuals = parallel_map(residual_after_fit, free, fits)
     correlations_of: dict[int, Correlation] = {}
     for channel in range(channels):
-        scale = _suspected(free, residuals, channel)
+        scale = _is_suspect(free, residuals, channel)
         if scale is None:
             continue
         best, nats = _likeliest(free, channels, correlations_of, channel, scale)
@@ -143,7 +143,7 @@ def few_of(items: Sequence[T]) -> list[T]:
     return [items[i] for i in np.unique(places)]
 
 
-def _with_free_effects(window: Window, slabs: ndarray) -> Window:
+def _free_effects(window: Window, slabs: ndarray) -> Window:
     """A window in which every effect may have a size of its own."""
     states = np.hstack((window.nuisance, window.effects))
     deviations = np.append(window.nuisance_sd, slabs)
@@ -151,7 +151,7 @@ def _with_free_effects(window: Window, slabs: ndarray) -> Window:
     return replace(window, nuisance=states, nuisance_sd=deviations, effects=none)
 
 
-def _suspected(
+def _is_suspect(
     windows: Sequence[Window], residuals: Sequence[ndarray], channel: int
 ) -> float | None:
     """Return the deviation of a channel's residual as a multiple of the stated one; None where

@@ -343,7 +343,7 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
     channels = len(gram.count)
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
     weighted = np.zeros((channels, count))
-    weighted[window.channel, np.arange(count)] = _unwhitened(window, white) / window.sigma
+    weighted[window.channel, np.arange(count)] = _unwhiten(window, white) / window.sigma
     by_state = weighted @ window.nuisance * window.nuisance_sd
     by_latent = np.zeros((channels, 0))
     if gram.latents:
@@ -353,7 +353,7 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 
 
-def _unwhitened(window: Window, white: ndarray) -> ndarray:
+def _unwhiten(window: Window, white: ndarray) -> ndarray:
     """Transpose of :func:`whitened`, of one column, shape (N,)."""
     out = white.copy()
     for rows, factor in window.correlated:

@@ -83,7 +83,7 @@ def fit(
         noise = _likeliest(windows, grams)
         time = noise.correlation_time
     shaped = correlated_of(grams, windows, time)
-    begin = replace(noise or _first_guess(shaped), correlation_time=time)
+    begin = replace(noise or _guess(shaped), correlation_time=time)
     return maximised(shaped, begin)[0], shaped
 
 
@@ -97,7 +97,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
     def likely(i: int, noise: Noise | None) -> float:
         if i not in levels_of:
             shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
-            begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
+            begin = replace(noise or _guess(shaped), correlation_time=CORRELATION_TIMES[i])
             levels_of[i] = maximised(shaped, begin, ROUGHLY_NATS)
         return levels_of[i][1]
 
@@ -116,7 +116,7 @@ def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
     """The levels as they concern some of the windows, whose ``grams`` these are, and a first guess
     of others.
     """
-    guess = _first_guess(grams).latent_sd
+    guess = _guess(grams).latent_sd
     levels = {key: noise.latent_sd.get(key, level) for key, level in guess.items()}
     return replace(noise, share=noise.share[list(windows)], latent_sd=levels)
 
@@ -125,11 +125,11 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of
     like grams, to search from.
     """
-    guess = only(start, grams, range(len(grams))) if start else _first_guess(grams)
+    guess = only(start, grams, range(len(grams))) if start else _guess(grams)
     return maximised(grams, guess, ROUGHLY_NATS)
 
 
-def _first_guess(grams: Sequence[Gram]) -> Noise:
+def _guess(grams: Sequence[Gram]) -> Noise:
     """Sensor noise as stated, latent forces where they just become visible."""
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
@@ -193,7 +193,7 @@ class _Layout:
 
     def limits(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
         """Lowest and highest values of the parameters."""
-        guess = _first_guess(grams).latent_sd
+        guess = _guess(grams).latent_sd
         visible = [guess[key] for key in self.keys]
         channels = len(grams[0].count)
         limits = []
@@ -324,7 +324,7 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[W
             break
         starts = [replace(windows[w], sigma=sigmas[w]) for w in windows_left]
         bare = parallel_map(partial(hidden_gram, channels=len(grams[0].count)), starts)
-    return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
+    return [_with_sigmas(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 
 def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarray]:
@@ -335,7 +335,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarr
     shaped = correlated_of(bare, windows, time)
     share = np.zeros((len(bare), len(LATENT_BLOCKS)))
     for row, gram in zip(share, bare):
-        for (block, _), level in _first_guess([gram]).latent_sd.items():
+        for (block, _), level in _guess([gram]).latent_sd.items():
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
@@ -352,7 +352,7 @@ def _outlier_distances(window: Window, residual: ndarray) -> ndarray:
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
 
 
-def _mended(window: Window, sigma: ndarray) -> Window:
+def _with_sigmas(window: Window, sigma: ndarray) -> Window:
     """The window with other sigmas, where these differ in a few samples."""
     share = (sigma > window.sigma).mean()
     if 0.0 < share <= HUBER_SHARE:

@@ -173,7 +173,7 @@ def _size(vector: ndarray) -> ndarray:
     return np.linalg.norm(vector, axis=1)
 
 
-def _scaled(factor: ndarray, vector: ndarray) -> ndarray:
+def _scale(factor: ndarray, vector: ndarray) -> ndarray:
     return factor[:, None] * vector
 
 
@@ -182,7 +182,7 @@ def _inverse(value: ndarray) -> ndarray:
     return 1.0 / np.maximum(value, LOWEST)
 
 
-def _saturated(vector: ndarray) -> ndarray:
+def _saturate(vector: ndarray) -> ndarray:
     """Direction of a vector, and less than a unit vector where it is slow."""
     return vector / np.hypot(_size(vector), SLOWEST)[:, None]
 
@@ -202,9 +202,9 @@ OPERATIONS: dict[str, Callable[..., ndarray]] = {
     "sum": np.add,
     "difference": np.subtract,
     "normal_part": normal_part,
-    "scaled": _scaled,
+    "scaled": _scale,
     "inverse": _inverse,
-    "saturated": _saturated,
+    "saturated": _saturate,
     "turn_rate": _turn_rate,
 }
 """Operations of :data:`sim.law_factors.QUANTITIES` on arrays at the knots."""

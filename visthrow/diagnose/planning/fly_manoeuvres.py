@@ -320,7 +320,7 @@ def fly(
     from sim.hybrid import HybridSim
 
     count = len(manoeuvres)
-    pos_w, yaw, rates_b, thrust_factor, release = (_stacked(manoeuvres, name) for name in ROWS)
+    pos_w, yaw, rates_b, thrust_factor, release = (_stack(manoeuvres, name) for name in ROWS)
     plant = replace(plant, sim=replace(plant.sim, control_period=SAMPLE_PERIOD))
     motors = plant.vehicle.controller
     thrusts = {"min_thrust": 4.0 * motors.min_thrust, "max_thrust": 4.0 * motors.max_thrust}
@@ -373,7 +373,7 @@ def fly(
     return flights
 
 
-def _stacked(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
+def _stack(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
     """Return rows of manoeuvres side by side, each at its last one from its end on."""
     columns = [getattr(m, name) for m in manoeuvres]
     rows = np.arange(max(map(len, columns)))

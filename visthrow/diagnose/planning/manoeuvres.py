@@ -128,7 +128,7 @@ def _steps(t: np.ndarray) -> np.ndarray:
     return 1.0 + 0.4 * _pulse(np.mod(t, 1.5), 0.15)
 
 
-def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+def _integrate_rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     """Integral of :func:`rise` over time."""
     s = _share(t, begin, length)
     after = np.maximum(t - begin - length, 0.0)
@@ -140,7 +140,7 @@ def _stop(t: np.ndarray) -> np.ndarray:
     stays taut.
     """
     distance = 1.5 * 0.5 * (1.6 + 0.3)
-    velocity = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
+    velocity = 1.5 * (_integrate_rise(t, 0.0, 1.6) - _integrate_rise(t, 1.6, 0.3))
     return velocity - distance * rise(t, 3.9, 2.5) - 0.5 * distance
 
 

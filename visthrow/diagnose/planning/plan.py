@@ -220,7 +220,7 @@ def _worth(p: FlightProposal) -> tuple[float, float]:
     return settles, p.nats / np.sqrt(p.seconds)
 
 
-def _expected_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:
+def _expect_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:
     """Return the latent forces of each block in each phase: where none were flown, those of the
     block's roughest phase.
     """
@@ -251,7 +251,7 @@ def expected_information(
     expected = replace(
         noise,
         scale=np.ones(channels),
-        latent_sd=_expected_levels(noise, {w.phase for w in windows}),
+        latent_sd=_expect_levels(noise, {w.phase for w in windows}),
         share=np.ones((len(windows), len(LATENT_BLOCKS))),
     )
     flown_theta = np.zeros(len(floors))

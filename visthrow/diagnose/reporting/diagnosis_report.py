@@ -190,7 +190,7 @@ def sections(
         _laws(diagnosis),
         *_catalogue(diagnosis),
         _blind(blind, diagnosis),
-        _next_flights(diagnosis),
+        _list_next_flights(diagnosis),
         _ground(diagnosis, step_check or {}, provenance or {}),
     ]
     return [part for part in listed if part.parts]
@@ -348,7 +348,7 @@ def _blind(blind: Blind | None, diagnosis: Diagnosis) -> Section:
     return section("blind", title, picture, grid)
 
 
-def _next_flights(diagnosis: Diagnosis) -> Section:
+def _list_next_flights(diagnosis: Diagnosis) -> Section:
     """Manoeuvres that the catalogue names for what stays open."""
     serves: dict[str, list[str]] = {}
     for f in diagnosis.findings:

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         gain = write_report(
             folder, diagnosis, opened.model, opened.logs, args.seed, limits, made_with
         )
-    tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
+    tested = _test(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
     if only_json:
         print(f"JSON: {folder / DIAGNOSIS}")
         if (folder / page.PAGE).exists():
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def _tested(
+def _test(
     test_flights: opening.Opened, diagnosis: Diagnosis
 ) -> dict[str, tuple[float, float, float]]:
     """Return prediction errors of other flights by the model as its setup has it without

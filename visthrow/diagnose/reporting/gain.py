@@ -174,7 +174,7 @@ def on_others(
     rms = []
     for model, sizes in ((before, {}), (after, theta)):
         windows = [w for w in model.windows(sizes) if finite(w) and w.flight not in without]
-        sums, outliers = _weighted_squares(windows, work.problem, noise)
+        sums, outliers = _sum_weighted_squares(windows, work.problem, noise)
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
     rows = np.column_stack((plain, named, floor)).tolist()
@@ -183,7 +183,7 @@ def on_others(
     return Tested(errors, len({w.flight for w in windows}), len(windows), samples, outliers)
 
 
-def _weighted_squares(
+def _sum_weighted_squares(
     windows: Sequence[Window], problem: Problem, noise: Noise
 ) -> tuple[np.ndarray, int]:
     """Return sums over the samples ahead of squared errors, of those expected of noise, and of

@@ -34,7 +34,7 @@ STEPS_ACROSS = 3
 NAMES_ACROSS = 26  # letters in a line of a set's names
 
 
-def _with_legend(figure) -> bytes:
+def _add_legend(figure) -> bytes:
     """Return the PNG of a figure, the labels of its first axes above it, each once."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     by_label = dict(zip(labels, handles))
@@ -87,7 +87,7 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
     bars.barh(best, [rates[name] for name in best], color=colours)
     bars.tick_params(axis="y", labelsize=6)
     bars.set(xlabel="expected nats a second")
-    return _with_legend(figure)
+    return _add_legend(figure)
 
 
 def residuals(work: Work, channel: int) -> bytes:
@@ -114,7 +114,7 @@ def residuals(work: Work, channel: int) -> bytes:
         axis.plot(time, factor * new, **LOOKS["residual"], **LOOKS["after"])
         axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
     axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
-    return _with_legend(figure)
+    return _add_legend(figure)
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
@@ -176,7 +176,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
     _plain(axis.xaxis)
     axis.tick_params(axis="x", top=True, labeltop=True)
-    return _with_legend(figure)
+    return _add_legend(figure)
 
 
 def horizons(gain: Gain) -> bytes:
@@ -192,7 +192,7 @@ def horizons(gain: Gain) -> bytes:
         axis.minorticks_off()
         _plain(axis.yaxis, (1, 2, 5))
     axes[0, 0].set_ylabel("error [sigma of the sensor]")
-    return _with_legend(figure)
+    return _add_legend(figure)
 
 
 def landings(landing: LandingGain) -> bytes:
@@ -205,7 +205,7 @@ def landings(landing: LandingGain) -> bytes:
     axis.plot(*np.stack((before, after)).transpose(2, 0, 1), **LOOKS["miss"])
     axis.plot(0.0, 0.0, **LOOKS["landing"])
     axis.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    return _with_legend(figure)
+    return _add_legend(figure)
 
 
 def confusion(diagnosis: Diagnosis) -> bytes:

@@ -143,7 +143,7 @@ def explain(
             f" {correlation.share:.1%} of its variance"
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    selection, commands = _searched(nominal, seed, say, laws)
+    selection, commands = _search(nominal, seed, say, laws)
     diagnosis = held_out.judged(conclude(selection, commands))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(selection.nominal.windows)
@@ -155,7 +155,7 @@ def explain(
     return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
 
 
-def _searched(
+def _search(
     nominal: Point, seed: int, say: Callable[[str], None], laws: bool
 ) -> tuple[Selector, Scatter | None]:
     """Select causes of the windows that the simulation follows, and lost commands."""
@@ -167,9 +167,9 @@ def _searched(
             needed = threshold(nominal.statistics, priors, np.random.default_rng(seed))
             count = f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights"
             say(f"{count}; a cause needs {needed:.1f} nats")
-            selection, commands = _selected(Selector(nominal, needed, say, laws), begin)
+            selection, commands = _select(Selector(nominal, needed, say, laws), begin)
             begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
-            untracked = _not_followed(selection) if further else []
+            untracked = _find_unfollowed(selection) if further else []
             if not untracked:
                 break
         say(f"{len(untracked)} windows are left out, which the simulation does not follow")
@@ -177,7 +177,7 @@ def _searched(
     return selection, commands
 
 
-def _not_followed(selection: Selector) -> list[int]:
+def _find_unfollowed(selection: Selector) -> list[int]:
     """Return windows that the simulation does not follow with the causes, at their sizes or where
     the derivatives would have them.
     """
@@ -191,7 +191,7 @@ def _not_followed(selection: Selector) -> list[int]:
     return untracked_windows(leads) if leads else []
 
 
-def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
+def _select(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
     """Select, and select again as if commands had got lost, where that may say more.
 
     Lost commands are a candidate that needs a linearisation of its own."""

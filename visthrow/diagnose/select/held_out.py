@@ -283,7 +283,7 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, held_out=measure(diagnosis))
         doubt = _doubt(diagnosis, diagnosis.held_out)
         if not doubt.names:
-            return _explained(diagnosis)
+            return _explain(diagnosis)
         diagnosis = _withdrawn(diagnosis, doubt)
     return diagnosis
 
@@ -345,19 +345,19 @@ def _disagreement(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
     return Doubt(unsure, why=why, reason=reason)
 
 
-def _explained(diagnosis: Diagnosis) -> Diagnosis:
+def _explain(diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis of confirmed names that says how much of the error is left."""
     if diagnosis.overall == result.UNKNOWN:
         return diagnosis
     gains = diagnosis.held_out.channels
-    unexplained = [] if compares_phases(diagnosis.work.after) else _unexplained(gains)
+    unexplained = [] if compares_phases(diagnosis.work.after) else _find_unexplained(gains)
     if not unexplained:
-        return replace(diagnosis, reasons=(_known(diagnosis),))
+        return replace(diagnosis, reasons=(_describe_known(diagnosis),))
     reasons = tuple(_remaining(c, diagnosis.work) for c in unexplained)
     return replace(diagnosis, overall=result.IN_PART, reasons=reasons)
 
 
-def _known(diagnosis: Diagnosis) -> str:
+def _describe_known(diagnosis: Diagnosis) -> str:
     """Return how many causes are named, and what held-out flights show beyond the noise."""
     text = f"{len(diagnosis.theta)} named"
     unsure = [f for f in diagnosis.findings if f.verdict == result.CANDIDATE]
@@ -378,7 +378,7 @@ def _known(diagnosis: Diagnosis) -> str:
     )
 
 
-def _unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
+def _find_unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
     """Return channels of which far more than noise is left."""
     return [c for c in gains if c.after > UNKNOWN_RATIO * c.floor]
 
@@ -395,7 +395,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     groups, _ = groups_of(point)
     none = np.zeros((len(set(groups)), len(point.theta)))
-    unexplained = _unexplained(channel_gains(work, groups, none))
+    unexplained = _find_unexplained(channel_gains(work, groups, none))
     if not unexplained:
         return diagnosis
     floors = floors_of(point)

@@ -128,19 +128,19 @@ class Linear:
             value = -np.inf
             if np.isfinite(penalty):
                 occam = self.shares(chosen)[1]
-                whole = evidence_of(self._freed(chosen), self.priors, columns_of(chosen))
+                whole = evidence_of(self._free(chosen), self.priors, columns_of(chosen))
                 value = whole - occam - penalty
             self._values[chosen] = value
         return self._values[chosen]
 
-    def _freed(self, chosen: Names) -> Statistics:
+    def _free(self, chosen: Names) -> Statistics:
         return freed(self.statistics, self.shares(chosen)[0], self.days)
 
     def total(self, chosen: Names) -> Posterior:
         """Return what all flights say beside a set's random shares."""
         shares = frozenset(self.shares(chosen)[0].items())
         if shares not in self._totals:
-            self._totals[shares] = Posterior.of(self._freed(chosen), self.priors)
+            self._totals[shares] = Posterior.of(self._free(chosen), self.priors)
         return self._totals[shares]
 
     def added(self, subset: Names) -> dict[Names, float]:
@@ -160,13 +160,13 @@ class Linear:
                     elif gain[j] > self._step - WINDOW:
                         self._shares.setdefault(new, self.shares(subset))
                         listed[new] = base + gain[j] - (self.penalty(new) - price)
-                for c in self._may_vary(subset):
+                for c in self._list_varying(subset):
                     new = subset | {c}
                     listed[new] = self.value(new)
             self._added[subset] = listed
         return self._added[subset]
 
-    def _may_vary(self, subset: Names) -> list[Candidate]:
+    def _list_varying(self, subset: Names) -> list[Candidate]:
         """Return the random shares that may be worth their penalty, those that promise most: each
         as if no other effect could stand in for it.
         """

@@ -181,11 +181,11 @@ def regathered(point: Point, integrals: Integrals | None = None, **changes: Any)
     changed = replace(point, **changes)
     if integrals is None:
         integrals = Integrals(changed.grams, changed.noise)
-    plain = _by_flight(integrals, changed.grams, changed.theta)
+    plain = _sum_by_flight(integrals, changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
 
 
-def _by_flight(integrals: Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
+def _sum_by_flight(integrals: Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
     statistics = integrals.statistics(grams, theta)
     return statistics.by(statistics.flights)
 
@@ -214,14 +214,14 @@ def linearise(
         extended = parallel_map(lambda w: with_terms(w, problem.terms, sizes_of), windows_of)
     if commands:
         extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
-    cleaned, raw = _cleaned(problem, extended)
+    cleaned, raw = _clean(problem, extended)
     noise, grams = levels.fit(cleaned, raw, start)
     integrals = Integrals(grams, noise)
     plain = cleaned
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
-    statistics = _by_flight(integrals, grams, theta)
+    statistics = _sum_by_flight(integrals, grams, theta)
     return Point(
         problem,
         theta,
@@ -247,7 +247,7 @@ def _commands(
     return commands
 
 
-def _cleaned(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window], list[Gram]]:
+def _clean(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window], list[Gram]]:
     """Return windows in which outliers weigh less, and their inner products."""
     floors = problem.priors.floor
     channels = len(problem.model.channels)

@@ -144,9 +144,9 @@ class Selector:
 
     def run(self, begin: Names = NOTHING) -> "Selector":
         """Select, beginning with a set."""
-        for start in self._tried(self.nominal, [begin] if begin else []):
+        for start in self._try(self.nominal, [begin] if begin else []):
             self._go(start)
-        while self._moved() or self._relinearised() or self._propose() or self._widen():
+        while self._moved() or self._relinearise() or self._propose() or self._widen():
             pass
         return self
 
@@ -165,15 +165,15 @@ class Selector:
         """Simulate the best sets, and go over to the one that is worth most; False where the
         present set stays.
         """
-        listed = self._listed()
+        listed = self._list_sets()
         leads = {}
         least = -np.inf
         near: list[Trial] = []  # a trial's matrices are large: others are forgotten
         better: list[Trial] = []
-        while chosen := self._next(listed, leads, least):
+        while chosen := self._choose_next(listed, leads, least):
             leads[chosen] = -np.inf
-            tried = self._tried(self.best.point, [chosen])
-            tried += self._tried(self.best.point, self._reduced(tried))
+            tried = self._try(self.best.point, [chosen])
+            tried += self._try(self.best.point, self._reduced(tried))
             leads |= {t.chosen: t.lead for t in tried}
             possible = [t for t in tried if t.lead > -self._limit(t.chosen)]
             near += [t for t in possible if self.is_admissible(t)]
@@ -181,7 +181,7 @@ class Selector:
             if better:
                 best = max(t.lead for t in better)
                 least = max(best, max(listed.values()) - WINDOW)
-        better = better or self._followed_up(listed)
+        better = better or self._follow_up(listed)
         if not better:
             self._keep(near)
             return False
@@ -196,12 +196,12 @@ class Selector:
         """
         earlier = self._visited - {self.best.chosen}
         known = [s for s in earlier if self._simulated.get(s, -np.inf) > -self._limit(s)]
-        again = self._tried(self.best.point, known)
+        again = self._try(self.best.point, known)
         near = near + [t for t in again if t.lead > -self._limit(t.chosen)]
         near.sort(key=lambda t: -t.lead)
         self.window = [(self.best, 0.0), *((t, max(-t.lead, 0.0)) for t in near)]
 
-    def _listed(self) -> dict[Names, float]:
+    def _list_sets(self) -> dict[Names, float]:
         """Return sets near the best, with the nats by which they are ahead of the present one by
         the statistics: of where it is, of noise levels that leave every effect its size, and sets
         of few causes by those of the model as it stands.
@@ -221,7 +221,7 @@ class Selector:
         ahead_of.pop(present, None)
         return ahead_of
 
-    def _next(
+    def _choose_next(
         self, listed: Mapping[Names, float], tried: Mapping[Names, float], minimum: float
     ) -> Names:
         """Return the next set to be simulated, the best that promises more than ``minimum`` [nats]
@@ -275,7 +275,7 @@ class Selector:
         nats = 0.5 * float(change @ point.information @ change)
         return min(WINDOW, STRONG + INEXACT * nats)
 
-    def _tried(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
+    def _try(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
         """Simulate sets from a point."""
         linear = self.linear(point)
         trials = []
@@ -283,7 +283,7 @@ class Selector:
             active = columns_of(s)
             sizes, occam = linear.shares(s)
             try:
-                begin = replace(self._with_blocks(point, active), shares=sizes)
+                begin = replace(self._take_blocks(point, active), shares=sizes)
                 trial = Trial(s, candidate(begin, active), occam)
             except DiagnoseError as error:
                 self.progress(f"{names_of(s)}: not simulated, {error}")
@@ -308,7 +308,7 @@ class Selector:
                 reduced.append(frozenset(members))
         return [s for s in reduced if s not in self._simulated]
 
-    def _with_blocks(self, point: Point, active: list[int]) -> Point:
+    def _take_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point, or one that was linearised with the kinds of blocks that a set asks
         for; once for each place in a row.
         """
@@ -321,7 +321,7 @@ class Selector:
             if np.array_equal(known.theta[kinds] != 0.0, theta[kinds] != 0.0):
                 return known
         if theta.tobytes() not in self._turned:
-            self._turned = {theta.tobytes(): self._linearised(theta, point)}
+            self._turned = {theta.tobytes(): self._linearise(theta, point)}
         return self._turned[theta.tobytes()]
 
     def _value(self, trial: Trial) -> float:
@@ -351,7 +351,7 @@ class Selector:
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         return all(terms.moves_landing(point, j) for j in laws)
 
-    def _followed_up(self, listed: Mapping[Names, float]) -> list[Trial]:
+    def _follow_up(self, listed: Mapping[Names, float]) -> list[Trial]:
         """Return the set that promises most of those that kept far less, simulated from derivatives
         and initial states of where it leads, if it is worth more than the present set simulated
         from the same derivatives and states.
@@ -371,11 +371,11 @@ class Selector:
         self._followed.add(chosen)
         active = columns_of(chosen)
         try:
-            origin = self._linearised(point.posterior.estimate(active), point)
+            origin = self._linearise(point.posterior.estimate(active), point)
         except DiagnoseError as error:
             self.progress(f"{names_of(chosen)}: not followed, {error}")
             return []
-        trials = {t.chosen: t for t in self._tried(origin, [chosen, self.best.chosen])}
+        trials = {t.chosen: t for t in self._try(origin, [chosen, self.best.chosen])}
         if len(trials) < 2 or not self.is_admissible(trials[chosen]):
             return []
         lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
@@ -384,7 +384,7 @@ class Selector:
         self.origin = origin
         return [replace(trials[chosen], lead=lead)]
 
-    def _relinearised(self) -> bool:
+    def _relinearise(self) -> bool:
         """Take derivatives where the best set is, once no other is better by the last ones; False
         where these still hold. Sets that were judged by derivatives from elsewhere may be tried
         again.
@@ -430,7 +430,7 @@ class Selector:
                 return point
         for _ in range(ROUNDS):
             try:
-                self.origin = self._linearised(point.theta, point)
+                self.origin = self._linearise(point.theta, point)
             except DiagnoseError as error:
                 self.progress(f"the last derivatives stay: {error}")
                 break
@@ -441,7 +441,7 @@ class Selector:
                 break
         return point
 
-    def _linearised(self, theta: np.ndarray, like: Point) -> Point:
+    def _linearise(self, theta: np.ndarray, like: Point) -> Point:
         return linearise(self.problem, theta, like.noise, shares=like.shares)
 
     def _record(

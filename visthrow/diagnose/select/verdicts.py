@@ -67,7 +67,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     model = selection.nominal.problem.model
     scatter, shares = random_shares_of(selection)
     varying = {j for c in shares if c.group != EVENT for j in c.columns}
-    point = _varied(selection, shares)
+    point = _vary(selection, shares)
     if commands:
         scatter = (*scatter, commands)
     calm = with_floors_noise(point, selection.best.columns)
@@ -105,13 +105,13 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         spread,
         selection.threshold,
         steps=tuple(selection.steps),
-        sets=_named_sets(selection),
+        sets=_list_sets(selection),
         levels=block_levels,
         laws=_different(explanations),
         events=_events(selection, point),
         alone=alone,
         sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
-        scatter=_with_means(scatter, in_units),
+        scatter=_add_means(scatter, in_units),
         mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
         flights=len(point.plain.flights),
@@ -121,7 +121,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     )
 
 
-def _varied(selection: Selector, shares: Shares) -> Point:
+def _vary(selection: Selector, shares: Shares) -> Point:
     """Give the best point these random shares, and return it."""
     point = selection.best.point
     if shares or point.shares:
@@ -130,7 +130,7 @@ def _varied(selection: Selector, shares: Shares) -> Point:
     return point
 
 
-def _with_means(scatter: Sequence[Scatter], means: Mapping[str, float]) -> tuple[Scatter, ...]:
+def _add_means(scatter: Sequence[Scatter], means: Mapping[str, float]) -> tuple[Scatter, ...]:
     """Return verdicts on what varies with the means of their effects in these flights."""
     verdicts = []
     for s in scatter:
@@ -170,7 +170,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
     catalogue = {v.name: v for v in random_effects()}
     verdicts = []
     shares = dict(best.point.shares)
-    for c in _asked_after(selection, catalogue.keys()):
+    for c in _list_asked(selection, catalogue.keys()):
         usual = c not in best.chosen
         statistics = best.point.plain
         beside = best.chosen
@@ -190,7 +190,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
     return tuple(verdicts), shares
 
 
-def _asked_after(selection: Selector, usual: Set[str]) -> list[Candidate]:
+def _list_asked(selection: Selector, usual: Set[str]) -> list[Candidate]:
     """Return the random shares that were selected, and the usual ones, by name, that were not."""
     varying = [c for c in selection.candidates if c.group in (FLIGHT, DAY)]
     selected = [c for c in varying if c in selection.best.chosen]
@@ -249,7 +249,7 @@ def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) ->
     return replace(point, plain=shared, shares={})
 
 
-def _named_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:
+def _list_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:
     """Return the names of each possible set, and its nats behind."""
     sets = []
     for trial, nats in selection.window:
@@ -397,11 +397,11 @@ def _overall(
         _contradiction(selection)
         or _law(selection, reasons)
         or _outside_bounds(selection, reasons)
-        or _crowded(selection, reasons)
+        or _answer_crowded(selection, reasons)
         or _misshapen(selection, reasons)
-        or _left_over(selection, excessive, reasons)
+        or _answer_left_over(selection, excessive, reasons)
         or _unlike(scatter)
-        or _explained(selection, scatter)
+        or _answer_explained(selection, scatter)
     )
 
 
@@ -439,7 +439,7 @@ def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
 def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     """Return the answer where the flights push an estimate beyond its bound."""
     active = selection.best.columns
-    stuck = [j for j in active if _on_bound(selection, j)]
+    stuck = [j for j in active if _is_on_bound(selection, j)]
     if not stuck:
         return None
     effects = [selection.problem.effects[j] for j in stuck]
@@ -452,12 +452,12 @@ def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | Non
     return result.UNKNOWN, block, [*reasons, reason], set(active)
 
 
-def _crowded(selection: Selector, reasons: Sequence[str]) -> Answer | None:
+def _answer_crowded(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     """Return the answer where the names in a block cost more together than a law that nobody wrote
     down, and the flights hardly tell some apart: parts of it are likelier.
     """
     law = selection.threshold + terms.LAW
-    for block, members in _by_block(selection).items():
+    for block, members in _list_by_block(selection).items():
         part = selection.best.point.information[np.ix_(members, members)]
         unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
         if len(members) * selection.threshold > law and unlike.min() < 0.5:
@@ -472,7 +472,7 @@ def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     leave: the true cause has another equation. Of several blocks, it is the one with most evidence.
     """
     best = selection.best
-    by_block = _by_block(selection)
+    by_block = _list_by_block(selection)
     strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
     in_blocks = {block: strongest[block] for block in by_block if block in strongest}
     curves = terms.best_curves(best.point, best.columns, in_blocks)
@@ -488,7 +488,7 @@ def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
 
 
-def _left_over(
+def _answer_left_over(
     selection: Selector, excessive: Sequence[Level], reasons: list[str]
 ) -> Answer | None:
     """Return the answer where latent forces are excessive; names that act in a block and leave it
@@ -516,7 +516,7 @@ def _unlike(scatter: Sequence[Scatter]) -> Answer | None:
     return result.UNKNOWN, forms[0].block, [reason], set()
 
 
-def _explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
+def _answer_explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
     """Return the answer where nothing is missing."""
     if selection.best.columns:
         return result.KNOWN, "", [], set()  # held-out flights give the reason
@@ -531,7 +531,7 @@ def _explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
     return result.NO_EFFECT, "", [nothing], set()
 
 
-def _by_block(selection: Selector) -> dict[str, list[int]]:
+def _list_by_block(selection: Selector) -> dict[str, list[int]]:
     """Return the names that act in each block; none where no calm phase tells what gusts are, for
     what is left over then speaks of a wrong form.
     """
@@ -550,7 +550,7 @@ def _excess(level: Level) -> str:
     )
 
 
-def _on_bound(selection: Selector, j: int) -> bool:
+def _is_on_bound(selection: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the
     threshold.
     """

@@ -71,7 +71,7 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     units = thrust_checks.UNITS | {"shares of the full thrust": full}
     mistakes: list[Mistake] = []
     for look in (_axes, _rate_unit):
-        relations = [relation for relation in map(_followed, logs) if relation is not None]
+        relations = [relation for relation in map(_relate_rates, logs) if relation is not None]
         if relations and (mistake := look(relations)) is not None:
             mistakes.append(mistake)
             logs = list(map(mistake.mended, logs))
@@ -94,7 +94,7 @@ def commanded(
     for i, log in enumerate(logs):
         if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
             continue
-        calibration = _calibrated(log)
+        calibration = _calibrate(log)
         if calibration is None:
             continue
         hover, slope, start, end = calibration
@@ -118,7 +118,7 @@ def commanded(
     return corrected, (Mistake("throttle", cause, equation, 0.0, len(shares)),)
 
 
-def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
+def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
     """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None
     where nothing flies.
     """
@@ -149,7 +149,7 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
 
 
-def _followed(log: FlightLog) -> relations.Relation | None:
+def _relate_rates(log: FlightLog) -> relations.Relation | None:
     """Return how the measured attitude's rates follow the commanded ones; None if nothing turns."""
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or len(attitude.time) < 50:

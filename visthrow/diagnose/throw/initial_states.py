@@ -193,14 +193,14 @@ def smoothed(
         if len(chosen.time) >= LEAST_SAMPLES:
             since = chosen.time - time
             if chosen.values.shape[1] == 4:
-                return _smoothed_turn(since, chosen.values)
+                return _smooth_turn(since, chosen.values)
             degree = 2 if len(since) < 12 else 3
             fit = np.polynomial.polynomial.polyfit(since, chosen.values, degree)
             return fit[0], fit[1]
     return None
 
 
-def _smoothed_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
+def _smooth_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
     """Attitude at time 0 (xyzw) and the body rate there [rad/s]."""
     middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
     turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()

@@ -150,7 +150,7 @@ def _fly(
     release = setting.plant.release
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
-    looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
+    looked = [_extend_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = model.cut_into(looked, flown)
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     measured = onward.fly(model.simulation(setting), states, lanes).seen
@@ -173,7 +173,7 @@ def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
     return [*cuts, Cut(number, "throw", begin, end, ATTACHED)]
 
 
-def _with_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
+def _extend_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
     """The flight with stamps of a payload all the way down in place of the measured ones."""
     if end is None:
         return flight

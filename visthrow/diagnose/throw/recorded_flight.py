@@ -91,13 +91,13 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
     if np.count_nonzero(fresh) < 5:
         return None
-    if not _rounded(values):
+    if not _is_rounded(values):
         time = time[fresh]
         values = values[fresh]
     if name == "quat_wb":
         values = continuous(values / np.linalg.norm(values, axis=1, keepdims=True))
     if name == "rate_b":
-        time, values = _thinned(time, values)
+        time, values = _thin(time, values)
         if len(time) < 5:
             return None
     noise = sensor_sigma(values)
@@ -108,7 +108,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     return ChannelSamples(time, values, max(float(sigma), LEAST_SIGMA[name]))
 
 
-def _thinned(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
+def _thin(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
     """Thin samples that come at twice :data:`SUFFICIENT_RATE` or faster, shape (T,) and (T, N), out
     to fewer that say as much: every n-th of them smoothed.
 
@@ -136,7 +136,7 @@ def _thinned(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
     return thinned[:, 0], thinned[:, 1:]
 
 
-def _rounded(values: ndarray) -> bool:
+def _is_rounded(values: ndarray) -> bool:
     """Whether most changes of a channel, shape (T, N), are of the one step that it was recorded in.
 
     Such samples repeat themselves without being stale. Without the repeated ones those would be
@@ -165,7 +165,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
     quat = _samples(log, "quat_wb")
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
-    pos, quat = _paired(pos, quat, number)
+    pos, quat = _pair(pos, quat, number)
     landing, landing_point = _landing(log)
     time, command = log["command"].samples()
     return RecordedFlight(
@@ -183,7 +183,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
     )
 
 
-def _paired(
+def _pair(
     pos: ChannelSamples, quat: ChannelSamples, number: int
 ) -> tuple[ChannelSamples, ChannelSamples]:
     """Positions and attitudes of the same times: of common stamps, else attitudes between their

@@ -154,7 +154,7 @@ class ReplayedFlights:
             name: fields[name].astype(int if kind[0] == "int" else float)
             for name, kind in WINDOW_FIELDS.items()
         }
-        self.recording = Recording(self.windows, self._recorded())
+        self.recording = Recording(self.windows, self._pack_recordings())
         self.rows = self.recording.rows
         self._groups = [_groups_of(*samples) for samples in self.samples]
         self.sigma = []
@@ -170,7 +170,7 @@ class ReplayedFlights:
             measured[has_value] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
-    def _recorded(self) -> dict[str, ndarray]:
+    def _pack_recordings(self) -> dict[str, ndarray]:
         """Return commands and stamps of all windows, as the kernel reads them."""
         vehicle, attitude, payload, gyro = zip(*self.samples)
         return {

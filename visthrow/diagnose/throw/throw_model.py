@@ -98,11 +98,11 @@ class ThrowModel(Model):
         self.substep = substep
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
+        states = self._settle_without_slack(flights, self._cuts_of(flights, hangs))
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._direct = direct_samples(logs, flights, self.flights.cuts, self.setting)
         direct = dict.fromkeys(d.channel for listed in self._direct.values() for d in listed)
-        self.channels = [*_measured(flights, any(hangs)), *direct]
+        self.channels = [*_list_channels(flights, any(hangs)), *direct]
         thrown = any(f.latch != NEVER for f in flights)
         silent = sum(f.voltage is None for f in flights)
         self.has_voltage = silent < len(flights)  # whether any log holds the battery's voltage
@@ -141,14 +141,14 @@ class ThrowModel(Model):
         """Return these windows of flights, in the time of their sensors."""
         return ReplayedFlights(flights, cuts, self.setting)
 
-    def _settled_without_slack(
+    def _settle_without_slack(
         self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
     ) -> States:
         """Take the windows without the time in which ropes were slack; returns initial states."""
         self.flights = self.cut_into(flights, cuts)
         simulation = self.simulation(self.setting)
         states, ends = carried(self.flights, simulation)
-        without_slack = self._without_slack(ends)
+        without_slack = self._cut_slack(ends)
         if without_slack != cuts:
             self.flights = self.cut_into(flights, without_slack)
             states, _ = carried(self.flights, simulation)
@@ -197,12 +197,12 @@ class ThrowModel(Model):
         for batch in grouped(self._retained, lanes, room):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         whole = []
-        for w, window in zip(self._retained, self._with_switches(theta, listed)):
+        for w, window in zip(self._retained, self._add_switches(theta, listed)):
             direct = self._direct.get(w, ())
             whole.append(with_direct(window, direct, self.channels, settings, steps))
         return whole
 
-    def _with_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
+    def _add_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
         """Return windows with columns of other kinds of blocks, and empty ones of what cameras
         alone show.
         """
@@ -359,7 +359,7 @@ class ThrowModel(Model):
         numbers = [channels.index(name) if name in channels else -1 for name in REPLAYED]
         return self.flights.spread(w, *numbers).astype(int)
 
-    def _without_slack(self, ends: States) -> list[Cut]:
+    def _cut_slack(self, ends: States) -> list[Cut]:
         """The windows, with the time in which the rope was slack until their ends cut out; those
         soon after it are marked so.
         """
@@ -414,7 +414,7 @@ def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
     return frozenset((name, float(value)) for name, value in theta.items() if value)
 
 
-def _measured(flights: Sequence[RecordedFlight], carries: bool) -> list[str]:
+def _list_channels(flights: Sequence[RecordedFlight], carries: bool) -> list[str]:
     """Return the channels of poses and rates that these flights have."""
     measured = [
         True,

@@ -100,7 +100,7 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
     return Row("answers", question.name, "warn", f"cannot be answered: {reason}")
 
 
-def _first(
+def _find_first(
     log: FlightLog, names: tuple[str, ...], fewest: int = 21
 ) -> tuple[str, Samples] | tuple[None, None]:
     """Name and samples of the first of several channels that holds so many; None and None without
@@ -117,7 +117,7 @@ def excitation(log: FlightLog) -> dict[str, float]:
     """Figures of what a log excites; what no channel tells is left out."""
     spans = [np.ptp(channel.time) for channel in log.channels.values() if len(channel.time) > 1]
     figures = {"seconds": max(spans, default=0.0)}
-    flown = _flown(log, figures)
+    flown = _find_flight(log, figures)
     _motion(log, figures, flown)
     _thrust(log, figures, flown)
     _payload(log, figures)
@@ -125,9 +125,9 @@ def excitation(log: FlightLog) -> dict[str, float]:
     return figures
 
 
-def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
+def _find_flight(log: FlightLog, figures: dict) -> tuple[float, float]:
     """First and last time in the air, by height or by thrust."""
-    _, path = _first(log, POSITIONS)
+    _, path = _find_first(log, POSITIONS)
     if path is None:
         return -np.inf, np.inf
     time = path.time
@@ -147,7 +147,7 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
 
 
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    _, path = _first(log, POSITIONS, 51)
+    _, path = _find_first(log, POSITIONS, 51)
     if path is not None:
         time, vel = path.derivative(0.1)
         flies = (time >= flown[0]) & (time <= flown[1])
@@ -155,7 +155,7 @@ def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
         if len(speed):
             figures["speed_p95_m_s"] = np.percentile(speed, 95)
             figures["seconds_hover"] = np.mean(speed < 0.15) * np.ptp(time[flies])
-    _, attitude = _first(log, ATTITUDES)
+    _, attitude = _find_first(log, ATTITUDES)
     if attitude is not None:
         x, y, z, w = attitude.values.T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
@@ -172,7 +172,7 @@ def _range(values: np.ndarray, part: float) -> np.ndarray:
 
 
 def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    name, driver = _first(log, THRUSTS)
+    name, driver = _find_first(log, THRUSTS)
     if driver is not None:
         values = driver.values[(driver.time >= flown[0]) & (driver.time <= flown[1])]
         thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
@@ -201,8 +201,8 @@ def _payload(log: FlightLog, figures: dict) -> None:
 
 
 def _standing(log: FlightLog, figures: dict) -> None:
-    _, place = _first(log, POSITIONS)
-    name, thrust = _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 1)
+    _, place = _find_first(log, POSITIONS)
+    name, thrust = _find_first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 1)
     idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0
     if thrust is not None:
         lowest = IDLE_SPEED if name == "motor_speed" else IDLE_SHARE

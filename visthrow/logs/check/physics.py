@@ -75,7 +75,7 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
     yield from _still_gravity(log)
     yield from _commands(log)
     yield from _cable(log, vehicle)
-    yield from _same(log)
+    yield from _check_same_quantity(log)
 
 
 def usable(samples: Samples | None, threshold: float) -> bool:
@@ -158,7 +158,7 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
         return
     message = log.notes(pos).get("message")
     one_clock = message is not None and message == log.notes(vel).get("message")
-    yield from _compared(place.derivative(), velocity, f"d({pos})/dt, {vel}", one_clock)
+    yield from _compare(place.derivative(), velocity, f"d({pos})/dt, {vel}", one_clock)
 
 
 def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
@@ -166,7 +166,7 @@ def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
     derived = _steady_rates(log[quat].samples())
     turns = usable(derived, MOVES) or usable(measured, MOVES)
     if turns and usable(derived, 0.0) and usable(measured, 0.0):
-        yield from _compared(derived, measured, f"rate of {quat}, rate_b")
+        yield from _compare(derived, measured, f"rate of {quat}, rate_b")
 
 
 def _steady_rates(attitudes: Samples) -> Samples:
@@ -181,7 +181,7 @@ def _steady_rates(attitudes: Samples) -> Samples:
     return Samples(rates.time[steady], rates.values[steady])
 
 
-def _compared(
+def _compare(
     first: Samples, second: Samples, channels: str, one_clock: bool = False
 ) -> Iterator[Row]:
     """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
@@ -197,7 +197,7 @@ def _compared(
         yield Row("frames", channels, "bad", text, figures)
         return
     if _turned(relation):
-        yield _in_other_axes(relation, channels, "go together")
+        yield _report_other_axes(relation, channels, "go together")
         return
     yield from _together_rows(relation, channels, figures, (0.67, 1.5))
     yield _late(relation, channels, figures, one_clock)
@@ -238,7 +238,7 @@ def _turned(relation: relations.Relation) -> bool:
     return relation.nats > _NATS and relation.axes_correlation > relation.correlation + CLEARLY
 
 
-def _in_other_axes(relation: relations.Relation, channels: str, words: str) -> Row:
+def _report_other_axes(relation: relations.Relation, channels: str, words: str) -> Row:
     """Report a pair that goes together in other axes."""
     figures = _figures(relation) | {"axes": relation.axes, "nats": relation.nats}
     return Row("frames", channels, "bad", f"{words} as {_better(relation)}", figures)
@@ -342,7 +342,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
         force_w = rotate(attitude.attitudes(force_b.time), force_b.values)
         pushed = Samples(force_b.time, force_w - _UP).mean_over(time, _SPAN)
     else:
-        hangs, relative = _carried(log, quat, time, acc)
+        hangs, relative = _find_hanging(log, quat, time, acc)
         if np.sum(hangs) < 50:
             return
         time = time[hangs]
@@ -351,16 +351,16 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     relation = relations.relate(Samples(time, acc), Samples(time, pushed))
     if relation is None:
         return
-    wrong = _exchanged(relation, channels)
+    wrong = _report_exchange(relation, channels)
     if wrong is None and sensed:
         wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is not None:
         yield wrong
     if wrong is None or wrong.verdict == "warn":
-        yield from _pushed(relation, acc, pushed, channels, sensed)
+        yield from _check_push(relation, acc, pushed, channels, sensed)
 
 
-def _carried(
+def _find_hanging(
     log: FlightLog, quat: str, time: np.ndarray, acc: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return at which times the payload hangs on its cable, shape (N,), and its acceleration less
@@ -479,7 +479,7 @@ def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
     return velocities.derivative(span)
 
 
-def _pushed(
+def _check_push(
     relation: relations.Relation, acc: np.ndarray, pushed: np.ndarray, channels: str, sensed: bool
 ) -> Iterator[Row]:
     """Rows about a push that has the axes of the change of velocity."""
@@ -510,7 +510,7 @@ def _pushed(
             yield Row("frames", channels, "warn", text, figures)
 
 
-def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
+def _report_exchange(relation: relations.Relation, channels: str) -> Row | None:
     """Report a path that goes with the push in other axes."""
     firm = relation.axes_correlation > _CORRELATED and relation.nats > _SHARED * _NATS
     if not firm or not _turned(relation):
@@ -558,7 +558,7 @@ def _commands(log: FlightLog) -> Iterator[Row]:
             channels = f"{name}, {turning}"
             early = _early(relation, set_points, rates, channels)
             period = max(np.median(np.diff(clock)) for clock in (time, rates.time))
-            yield early or _followed(relation, channels, spread, period)
+            yield early or _check_following(relation, channels, spread, period)
 
 
 def _early(
@@ -587,7 +587,9 @@ def _early(
     return Row("delay", channels, "bad", text, figures)
 
 
-def _followed(relation: relations.Relation, channels: str, spread: float, period: float) -> Row:
+def _check_following(
+    relation: relations.Relation, channels: str, spread: float, period: float
+) -> Row:
     """Report how rates follow their commands.
 
     Args:
@@ -607,7 +609,7 @@ def _followed(relation: relations.Relation, channels: str, spread: float, period
         )
         return Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)
     if _turned(relation):
-        return _in_other_axes(relation, channels, "the rates follow the commands")
+        return _report_other_axes(relation, channels, "the rates follow the commands")
     is_measured = relation.delay_sd < _UNTOLD
     late = is_measured and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
@@ -678,12 +680,12 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     yield Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)
     if vehicle.cable_length:
         yield _length(middle, vehicle.cable_length, channels)
-    yield from _left_early(log, payload.time, gap)
+    yield from _check_early_release(log, payload.time, gap)
     hung = Samples(payload.time[hanging], payload.values[hanging])
     yield from _payload_late(place, hung, channels)
 
 
-def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:
+def _check_early_release(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:
     """Report a payload that leaves its cable before its release is commanded."""
     if "release_command" not in log:
         return
@@ -745,7 +747,7 @@ def _payload_late(place: Samples, payload: Samples, channels: str) -> Iterator[R
     yield Row("delay", channels, verdict, text, {"delay_s": delay, "nats": nats})
 
 
-def _same(log: FlightLog) -> Iterator[Row]:
+def _check_same_quantity(log: FlightLog) -> Iterator[Row]:
     """Two measurements of one quantity on different clocks: the delay between them, and whether it
     holds.
     """
@@ -755,7 +757,7 @@ def _same(log: FlightLog) -> Iterator[Row]:
         b = log.samples(second)
         if not (usable(a, MOVES) and usable(b, MOVES)):
             continue
-        rows = list(_compared(a, b, f"{first}, {second}"))
+        rows = list(_compare(a, b, f"{first}, {second}"))
         yield from rows
         bad = bad or worst(rows) == "bad"
         if not bad:

@@ -67,13 +67,13 @@ def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | 
         return None
     grid = start + period * np.arange(count)
     steps = int(reach / period)
-    relation, follows = _related(first, second, grid, period, steps)
+    relation, follows = _relate(first, second, grid, period, steps)
     if relation is not None and not np.all(follows):
-        relation, _ = _related(first, second, grid[follows], period, steps)
+        relation, _ = _relate(first, second, grid[follows], period, steps)
     return relation
 
 
-def _related(
+def _relate(
     first: Samples, second: Samples, grid: np.ndarray, period: float, steps: int
 ) -> tuple[Relation | None, np.ndarray]:
     """Relation at the times of a grid [s], and which of them go with the rest."""

@@ -36,7 +36,7 @@ class Checked:
 
 def check(logs: Sequence[FlightLog], vehicle: KnownVehicle = NOTHING) -> list[Checked]:
     """Look at logs one by one, and at what they have in common."""
-    common = [*_copies(logs), *_shared_payloads(logs), *_masses(logs, vehicle)]
+    common = [*_copies(logs), *_compare_shared_payloads(logs), *_masses(logs, vehicle)]
     checked = []
     for i, log in enumerate(logs):
         shared = [row for number, row in common if number == i]
@@ -209,7 +209,7 @@ def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> Iterator[tuple[
             yield i, Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})
 
 
-def _shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
+def _compare_shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
     """Compare the clocks of several vehicles that carry one payload."""
     paths = {}
     for i, log in enumerate(logs):

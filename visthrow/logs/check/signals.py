@@ -192,7 +192,7 @@ def _values(name: str, channel: Channel) -> Iterator[Row]:
     if measured and _speaks_of(name, _NEVER_STUCK):
         yield from _stuck(name, values, time)
     if measured and _speaks_of(name, _RAILED) and name not in _SWITCHES:
-        yield from _railed(name, values)
+        yield from _check_rails(name, values)
     if channel.unit in _FASTEST and not _speaks_of(name, _COMMANDED):
         yield from _jumps(name, values, time, channel.unit)
 
@@ -228,7 +228,7 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
         yield Row("values", name, "warn", text, figures)
 
 
-def _railed(name: str, values: np.ndarray) -> Iterator[Row]:
+def _check_rails(name: str, values: np.ndarray) -> Iterator[Row]:
     rails = [(0.0, "")]
     stops = _speaks_of(name, _STOPS_AT_ZERO)  # switched off is no rail
     for column in values.T[np.ptp(values, axis=0) > 0.0]:

@@ -239,7 +239,7 @@ def _along_path(log: FlightLog) -> Samples | None:
     force_z = _along_z(log, "path")
     if force_z is None:
         return None
-    return Samples(force_z.time, _trimmed(force_z.values.T).T)
+    return Samples(force_z.time, _trim(force_z.values.T).T)
 
 
 def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.ndarray, float]]:
@@ -270,8 +270,8 @@ def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.nd
         splits = np.flatnonzero(np.diff(load[steady])) + 1
         xs = np.split(x, splits)
         ys = np.split(y, splits, axis=1)
-        trimmed_x = [_trimmed(part) for part in xs]
-        trimmed_y = [_trimmed(part) for part in ys]
+        trimmed_x = [_trim(part) for part in xs]
+        trimmed_y = [_trim(part) for part in ys]
         curves = [
             _curve(_relative(xs), _relative(ys)),
             _curve(_relative(trimmed_x), _relative(trimmed_y)),
@@ -298,7 +298,7 @@ def _curve(x: np.ndarray, varies: np.ndarray) -> tuple[np.ndarray, float] | None
     return curve, 0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best]))
 
 
-def _trimmed(values: np.ndarray) -> np.ndarray:
+def _trim(values: np.ndarray) -> np.ndarray:
     """Return values, shape (..., T), cut to what lies within some robust deviations of their
     median.
     """
@@ -378,10 +378,10 @@ def _turning(log: FlightLog) -> Iterator[Row]:
         driven = Samples(motors.time, torque[:, None])
         relation = relations.relate(driven, Samples(time_d, turning[:, axis : axis + 1]), 0.2)
         if relation is not None and relation.axes_correlation >= 0.2:
-            yield _turned_by(word, relation, f"{name}, rate_b")
+            yield _check_turning(word, relation, f"{name}, rate_b")
 
 
-def _turned_by(word: str, relation: relations.Relation, channels: str) -> Row:
+def _check_turning(word: str, relation: relations.Relation, channels: str) -> Row:
     """Report whether an axis turns as the motors drive it."""
     figures = {"correlation": relation.correlation, "delay_s": relation.delay}
     clear = relation.axes_correlation > relation.correlation + CLEARLY

@@ -128,7 +128,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
             signal = _channel(tap, log, vehicle, str(path), left_out)
             if signal is not None:
                 channels[tap.channel], notes[tap.channel] = signal
-    left_out += _of_other_kinds(log, taps)
+    left_out += _list_untaken(log, taps)
     _add_sweep(channels, notes, log)
     if not channels:
         raise LogError(
@@ -184,7 +184,7 @@ def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Cha
     with np.errstate(invalid="ignore"):  # damaged floats
         values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
     if entry.name == "vel_w" and "velocity_frame" in fields:
-        values = _in_world(values, fields)
+        values = _to_world(values, fields)
     return make_channel(fields["time"], values, entry, source, ~valid_rows(fields, tap.good))
 
 
@@ -207,15 +207,15 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     if data is None:
         return FlightLog({})
     if message == "POS":
-        data = data | _from_globe(data, log.first("ORGN"))
+        data = data | _to_local(data, log.first("ORGN"))
     sources = {_pose_part(tap): (tap, data) for tap in reversed(taps) if _fits(tap, message, data)}
     together = [*sources]
     if "quat_wb" not in sources:
-        for name, source in _estimated_attitude(taps, log).items():
+        for name, source in _find_attitude(taps, log).items():
             sources.setdefault(name, source)
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
-    channels = {name: _of_pose(name, *source, str(path)) for name, source in sources.items()}
+    channels = {name: _read_pose(name, *source, str(path)) for name, source in sources.items()}
     counters = [data[name] for name in (*RESETS, "heading_reset_counter") if name in data]
     arrival = ChannelMap("arrival", ("arrival",), "s"), data["arrival"]
     resets = ChannelMap("resets", ("resets",), "1"), np.sum([0.0 * data["time"], *counters], axis=0)
@@ -254,7 +254,7 @@ def _fits(tap: Tap, message: str, fields: Fields) -> bool:
     return tap.message == message and all(column in fields for column in tap.columns.split())
 
 
-def _estimated_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
+def _find_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
     """Return where the vehicle's own attitude and rates stand."""
     sources: dict[str, tuple[Tap, Fields]] = {}
     for tap in taps:
@@ -265,7 +265,7 @@ def _estimated_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, 
     return sources
 
 
-def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
+def _read_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     """Return a part of a pose about the autopilot's axes, without the samples that are not known;
     a position keeps those that are not valid.
     """
@@ -274,7 +274,7 @@ def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     return channel if part == "pos_w" else channel.only(np.asarray(channel.valid))
 
 
-def _in_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
+def _to_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
     """Return velocities in the world frame; NaN for a body's without an attitude."""
     quat = np.column_stack([odometry[f"q[{i}]"] for i in (1, 2, 3, 0)]).astype(float)
     with np.errstate(invalid="ignore"):  # of attitudes that are not known
@@ -282,7 +282,7 @@ def _in_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
     return np.where((odometry["velocity_frame"] == BODY_FRAME)[:, None], vel_w, vel)
 
 
-def _from_globe(data: Fields, origins: Fields | None) -> Fields:
+def _to_local(data: Fields, origins: Fields | None) -> Fields:
     """Return north, east and down [m] from the estimator's origin, else from the first position."""
     lat = data["Lat"][0]
     lng = data["Lng"][0]
@@ -335,7 +335,7 @@ def _moving(
     return next(iter([*moving, *candidates]), None)
 
 
-def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
+def _list_untaken(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
     """Yield messages of which every row is of a kind that no tap takes."""
     limited = [tap for tap in taps if tap.only is not None]
     for message in dict.fromkeys(tap.message for tap in limited):

@@ -114,7 +114,7 @@ def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
             raise LogError(f"it begins with {head.hex(' ') or 'nothing'}, not a3 95")
         log = DFReader_binary(str(path))
         available = {fmt.name for fmt in log.formats.values()} & {*names, "MSG"}
-        while available and (message := _next_message(log, list(available), columns)) is not None:
+        while available and (message := _read_next(log, list(available), columns)) is not None:
             row = message.to_dict()
             instance = next((row[name] for name in _INSTANCE if isinstance(row.get(name), int)), 0)
             text = str(row.get("Message", ""))
@@ -132,7 +132,7 @@ def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
     return Messages(Path(path), "dataflash", columns.arrays(), meta, parameters)
 
 
-def _next_message(log: Any, names: list[str], columns: "_Columns") -> Any:
+def _read_next(log: Any, names: list[str], columns: "_Columns") -> Any:
     """Return the next message; None at the end, and where the reader fails after it gave some."""
     try:
         return log.recv_match(type=names)

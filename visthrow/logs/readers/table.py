@@ -312,12 +312,12 @@ def make_channel(
         valid &= ~bad[rows[~blank]]
         notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
     if entry.held and len(values):
-        fresh = _changed(values)
+        fresh = _find_changes(values)
         notes["held"] = int(np.sum(~fresh))
         time = time[fresh]
         values = values[fresh]
         valid = valid[fresh]
-    values = _converted(np.where(valid[:, None], values, 0.0), entry, factor)
+    values = _convert(np.where(valid[:, None], values, 0.0), entry, factor)
     if entry.kind != "vector":
         unit = "1"
         norm = np.linalg.norm(values, axis=1)
@@ -335,7 +335,7 @@ def make_channel(
         raise LogError(f"{source}: channel '{entry.name}': {error}") from error
 
 
-def _changed(values: np.ndarray) -> np.ndarray:
+def _find_changes(values: np.ndarray) -> np.ndarray:
     """Tell the rows that differ from the row before, bool, shape (T,); the first one does."""
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
     return np.append(True, ~np.all(same, axis=1))
@@ -381,7 +381,7 @@ def lost_rows(values: np.ndarray) -> np.ndarray:
     return lost
 
 
-def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray:
+def _convert(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray:
     values = (values * entry.scale + entry.offset) * factor
     if entry.kind == "vector":
         if entry.axes and values.shape[1] == 3:

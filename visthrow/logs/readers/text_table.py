@@ -75,10 +75,10 @@ def layout_of(text: str, name: str = "") -> TextTable:
     if not widths:
         return TextTable(rows[0][1] if rows else [], [], False)
     width = widths.most_common(1)[0][0]
-    start = _first_row(rows, width)
+    start = _find_first_row(rows, width)
     head = rows[:start]
     body = rows[start:]
-    named, settings, rate = _sorted_head(head, _names_start(rows, start), width, blank)
+    named, settings, rate = _sort_head(head, _names_start(rows, start), width, blank)
     unnamed = width > len(named[-1] if named else [])
     if unnamed and len(body) > 1 and all(cells[-1] == "" for _, cells in body):
         body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
@@ -103,7 +103,7 @@ def _cells(text: str, mark: str, name: str) -> Rows:
     return rows
 
 
-def _first_row(rows: Rows, width: int) -> int:
+def _find_first_row(rows: Rows, width: int) -> int:
     """Return the row at which the numbers begin: identifiers above them are numbers too, but three
     rows of numbers in a line are the table.
     """
@@ -178,7 +178,7 @@ def _commas(mark: str, body: Rows) -> bool:
     )
 
 
-def _sorted_head(
+def _sort_head(
     head: Rows, cut: int, width: int, blank: bool
 ) -> tuple[list[list[str]], dict[str, str], float]:
     """Lines above the numbers: those that name columns, the settings, and the rate."""
@@ -186,7 +186,7 @@ def _sorted_head(
     settings: dict[str, str] = {}
     rate = 0.0
     for i, (_, cells) in enumerate(head):
-        cells = _uncommented(cells, width)
+        cells = _strip_comment(cells, width)
         if not any(cells):
             continue
         if cells.count("") == len(cells) - 1 and is_number("".join(cells)):
@@ -210,7 +210,7 @@ def _names_columns(cells: list[str], width: int) -> bool:
     return len(cells) <= width and (count > width / 2 or not cells[0])
 
 
-def _uncommented(cells: list[str], width: int) -> list[str]:
+def _strip_comment(cells: list[str], width: int) -> list[str]:
     """Cells of a line of the head without the mark of a comment and surplus blanks at its end."""
     if cells[0].startswith(("#", "%")):
         first = cells[0].lstrip("#% ")
@@ -224,14 +224,14 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
     """Names of columns, of all lines that name them, unlike each other."""
     several = len(named) > 1
     units, parts = _units_and_words(named, width)
-    final = next((row for row in reversed(named) if not _all_units(row)), named[-1])
+    final = next((row for row in reversed(named) if not _is_row_of_units(row)), named[-1])
     names = []
     for i, (last, words) in enumerate(zip(final, parts)):
         name = last if i == 0 or _FRAME.fullmatch(last) else ".".join(words)
         name = name.replace(":", ".") if several else name
-        names.append(_joined(name, units[i], settings))
+        names.append(_join(name, units[i], settings))
     if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings:
-        names = _prefixed(names)
+        names = _add_body_names(names)
     return [name or f"column {i}" for i, name in enumerate(names, start=1)]
 
 
@@ -241,14 +241,14 @@ def _units_and_words(named: list[list[str]], width: int) -> tuple[list[str], lis
     units = [""] * width
     parts: list[list[str]] = [[] for _ in range(width)]
     for row in named:
-        if several and _all_units(row):
+        if several and _is_row_of_units(row):
             units = [unit_of(cell) or "" for cell in row]
         elif not _identifies(row, several):
             _add_names(parts, row)
     return units, parts
 
 
-def _all_units(row: list[str]) -> bool:
+def _is_row_of_units(row: list[str]) -> bool:
     """Whether every filled cell of a row is a unit."""
     return all(unit_of(cell) is not None for cell in row if cell)
 
@@ -271,7 +271,7 @@ def _add_names(parts: list[list[str]], row: list[str]) -> None:
             parts[i].append(last)
 
 
-def _joined(name: str, unit: str, settings: dict[str, str]) -> str:
+def _join(name: str, unit: str, settings: dict[str, str]) -> str:
     """Return a name with its unit; a subject that bears the name of its body is named once."""
     parts = name.split(".")
     name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
@@ -286,7 +286,7 @@ def _joined(name: str, unit: str, settings: dict[str, str]) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def _prefixed(names: list[str]) -> list[str]:
+def _add_body_names(names: list[str]) -> list[str]:
     """Qualisys' columns: the body's name stands before its first, and its lengths are in mm."""
     joined = []
     body = ""

@@ -37,16 +37,16 @@ class Vehicle:
 
 def vehicle_of(log: Messages) -> Vehicle:
     """Say which vehicle a log is of."""
-    reader = {"ulog": _of_px4, "dataflash": _of_ardupilot}.get(log.kind, _of_heartbeat)
+    reader = {"ulog": _read_px4, "dataflash": _read_ardupilot}.get(log.kind, _read_heartbeat)
     return reader(log)
 
 
-def _named(table: str, number: float, default: Any = "") -> Any:
+def _name_of(table: str, number: float, default: Any = "") -> Any:
     """Return what a table of ``vehicles.toml`` calls a number."""
     return TABLES[table].get(str(int(number)), default)
 
 
-def _of_px4(log: Messages) -> Vehicle:
+def _read_px4(log: Messages) -> Vehicle:
     parameters = log.parameters
     status = log.first("vehicle_status") or {}
     if max(status.get("is_vtol", ()), default=0) > 0:
@@ -54,7 +54,7 @@ def _of_px4(log: Messages) -> Vehicle:
     kind = _kind_of_px4(parameters)
     if kind not in ("", QUADROTOR):
         return Vehicle(kind, (), ())
-    motors = _by_place(parameters) if kind and "CA_ROTOR0_PX" in parameters else X
+    motors = _order_motors(parameters) if kind and "CA_ROTOR0_PX" in parameters else X
     plus = int(parameters.get("SYS_AUTOSTART", 0)) // 1000 == 5
     if plus or (kind and not motors):
         return Vehicle(f"{QUADROTOR} that is no X", (), ())
@@ -62,15 +62,15 @@ def _of_px4(log: Messages) -> Vehicle:
 
 
 def _kind_of_px4(parameters: Mapping[str, float]) -> str:
-    kind = _named("px4_airframes", parameters.get("CA_AIRFRAME", 0))
-    kind = kind or _named("mav_types", parameters.get("MAV_TYPE", 0))
+    kind = _name_of("px4_airframes", parameters.get("CA_AIRFRAME", 0))
+    kind = kind or _name_of("mav_types", parameters.get("MAV_TYPE", 0))
     count = int(parameters.get("CA_ROTOR_COUNT", 0))
     if count and kind in ("", QUADROTOR):
-        kind = _named("rotors", count, f"vehicle of {count} rotors")
-    return kind or _named("px4_autostart", parameters.get("SYS_AUTOSTART", 0) // 1000)
+        kind = _name_of("rotors", count, f"vehicle of {count} rotors")
+    return kind or _name_of("px4_autostart", parameters.get("SYS_AUTOSTART", 0) // 1000)
 
 
-def _by_place(parameters: Mapping[str, float]) -> tuple[int, ...]:
+def _order_motors(parameters: Mapping[str, float]) -> tuple[int, ...]:
     """Motors by where they sit; () where each quarter has not one."""
     corners: dict[tuple[bool, bool], int] = {}
     for i in range(4):
@@ -81,16 +81,16 @@ def _by_place(parameters: Mapping[str, float]) -> tuple[int, ...]:
     return tuple(corners[place] for place in places) if len(corners) == 4 else ()
 
 
-def _of_ardupilot(log: Messages) -> Vehicle:
+def _read_ardupilot(log: Messages) -> Vehicle:
     parameters = log.parameters
     words = str(log.meta.get("firmware", "")).split()
     kind = TABLES["ardupilot_firmwares"].get(words[0] if words else "", "")
     if kind == "plane" and parameters.get("Q_ENABLE", 0.0) > 0.0:
         kind = "VTOL"
-    kind = kind or _named("ardupilot_classes", parameters.get("FRAME_CLASS", 0))
+    kind = kind or _name_of("ardupilot_classes", parameters.get("FRAME_CLASS", 0))
     if kind not in ("", QUADROTOR):
         return Vehicle(kind, (), ())
-    motors = tuple(_named("ardupilot_x", parameters.get("FRAME_TYPE", 1), ()))
+    motors = tuple(_name_of("ardupilot_x", parameters.get("FRAME_TYPE", 1), ()))
     if not motors:
         return Vehicle(f"{QUADROTOR} that is no X", (), ())
     functions = {int(parameters.get(f"SERVO{n}_FUNCTION", 0)): n - 1 for n in range(32, 0, -1)}
@@ -98,9 +98,9 @@ def _of_ardupilot(log: Messages) -> Vehicle:
     return Vehicle(kind, motors, outputs)
 
 
-def _of_heartbeat(log: Messages) -> Vehicle:
+def _read_heartbeat(log: Messages) -> Vehicle:
     beat = log.first("HEARTBEAT") or {}
-    kinds = {_named("mav_types", number) for number in beat.get("type", ())} - {""}
+    kinds = {_name_of("mav_types", number) for number in beat.get("type", ())} - {""}
     if len(kinds) != 1 or QUADROTOR in kinds:
         return Vehicle(QUADROTOR if kinds else "")
     return Vehicle(kinds.pop(), (), ())

@@ -97,9 +97,9 @@ class FlyerModel(DrivenModel):
         """See the base class; commands that an autopilot logs of its own motors all came."""
         if self.params.input != "command":
             return []
-        return [self._without_each(self.size(theta), i) for i in windows]
+        return [self._change_without_each(self.size(theta), i) for i in windows]
 
-    def _without_each(self, size: ndarray, i: int) -> ndarray:
+    def _change_without_each(self, size: ndarray, i: int) -> ndarray:
         """Return the change of a window's samples by each command that does not come, shape
         (N, T).
         """

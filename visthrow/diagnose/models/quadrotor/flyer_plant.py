@@ -25,14 +25,14 @@ NO_CABLE = CableParams(1.0, 1.0)  # of a vehicle whose windows have no payload
 
 
 @cache
-def _known_plant() -> PlantParams:
+def _neutral_plant() -> PlantParams:
     """Return a plant for the numbers that do nothing where thrusts and attitudes are given."""
     return plant_of(load_experiment("state"))
 
 
 def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantParams:
     """Return the plant of a setup as it stands, whose commands are the motors' thrusts at once."""
-    base = _known_plant()
+    base = _neutral_plant()
     torque = params.torque or TorqueParams(
         (params.mass * UNTURNED**2,) * 3, ARM, ARM, ALMOST_NONE, (1.0, -1.0, -1.0, 1.0)
     )

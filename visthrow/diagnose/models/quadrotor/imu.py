@@ -58,7 +58,7 @@ class ImuModel(DrivenModel):
             self.channels = CHANNELS[:1]
         self.needed = (params.input, *self.channels)
         self.inputs = (params.input, *in_all(logs, "battery_voltage"))
-        turned = [r for log in logs if (r := _turned(log, params)) is not None]
+        turned = [r for log in logs if (r := _relate_turning(log, params)) is not None]
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
             self.channels = CHANNELS[:1]
             self.notes = (_why_not(turned, params.input),)
@@ -128,7 +128,7 @@ class ImuModel(DrivenModel):
         return turning
 
 
-def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
+def _relate_turning(log: FlightLog, params: ImuParams) -> Relation | None:
     """Relate the angular acceleration to what the commands' torques would give; None where a
     channel lacks, nothing turns, or the setup states no torques.
     """

@@ -89,7 +89,7 @@ def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     meta["start"] = float(time[0]) if len(time) else 0.0
     meta["ingest"] = {}
     channels: dict[str, Channel] = {}
-    for entry in [*_sensed(header), *_driven(table, header)]:
+    for entry in [*_sensor_channels(header), *_driven(table, header)]:
         if table.keys() >= set(entry.columns):
             values = np.column_stack([table[column] for column in entry.columns])
             channel, notes = make_channel(time - meta["start"], values, entry, meta["source"])
@@ -98,11 +98,11 @@ def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     return FlightLog(channels, meta)
 
 
-def _numbered(name: str, numbers: Iterable[int]) -> tuple[str, ...]:
+def _number_names(name: str, numbers: Iterable[int]) -> tuple[str, ...]:
     return tuple(f"{name}[{number}]" for number in numbers)
 
 
-def _sensed(header: dict[str, str]) -> list[ChannelMap]:
+def _sensor_channels(header: dict[str, str]) -> list[ChannelMap]:
     """Return the channels of sensors and set-points."""
     acc_1g = float(header.get("acc_1G", _ACC_1G)) or _ACC_1G
     scales = {"gyro": _gyro_scale(header), "acc": 1.0 / acc_1g}
@@ -118,11 +118,11 @@ def _driven(table: Table, header: dict[str, str]) -> list[ChannelMap]:
     if not count:
         return []
     order = MOTOR_ORDER if count == 4 else range(count)
-    motors = _numbered("motor", order)
+    motors = _number_names("motor", order)
     entries = [ChannelMap("motor_command", motors, "1", scale=1.0 / span, offset=-low / span)]
     if count == 4:
         poles = float(header.get("motor_poles", 14)) or 14.0
-        rpm = _numbered("eRPM", order)
+        rpm = _number_names("eRPM", order)
         entries.append(ChannelMap("motor_speed", rpm, "rpm", scale=100.0 * 2.0 / poles))
     return entries
 

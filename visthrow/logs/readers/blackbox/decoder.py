@@ -214,7 +214,7 @@ class _Decoder:
         start = reader.pos
         reader.pos += 1
         if kind == "E":
-            return self._noted(log)
+            return self._note_event(log)
         if kind not in self.plans:
             return None
         base = self.history if kind == "P" else []
@@ -232,7 +232,7 @@ class _Decoder:
         self.last_iteration = values[self.at_iteration]
         return values
 
-    def _noted(self, log: BlackboxLog) -> Frame | None:
+    def _note_event(self, log: BlackboxLog) -> Frame | None:
         """Note the next event; None: no event."""
         event = _event(self.reader)
         if event is None:
@@ -253,12 +253,12 @@ class _Decoder:
         for i, predictor in enumerate(definition.predictor):
             if predictor == ZERO:
                 continue
-            values[i] = self._predicted(predictor, i, values, base)
+            values[i] = self._predict(predictor, i, values, base)
             unsigned = definition.signed and i < len(definition.signed) and not definition.signed[i]
             values[i] = values[i] & 0xFFFFFFFF if unsigned else extend(values[i], 32)
         return values
 
-    def _predicted(self, predictor: int, i: int, values: Frame, base: list[Frame]) -> int:
+    def _predict(self, predictor: int, i: int, values: Frame, base: list[Frame]) -> int:
         value = values[i]
         if predictor in self.constant:
             return value + self.constant[predictor]
@@ -269,7 +269,7 @@ class _Decoder:
         if not base:
             return value
         if predictor == INC:
-            return base[0][i] + 1 + self._skipped()
+            return base[0][i] + 1 + self._count_skipped()
         if predictor == PREVIOUS:
             return value + base[0][i]
         if predictor == STRAIGHT_LINE:
@@ -278,7 +278,7 @@ class _Decoder:
             return value + int((base[0][i] + base[1][i]) / 2)  # C rounds towards zero
         raise Corrupt
 
-    def _skipped(self) -> int:
+    def _count_skipped(self) -> int:
         """Return the iterations since the last main frame that are left out on purpose."""
         if self.last_iteration is None:
             return 0
