@@ -440,21 +440,16 @@ def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) 
 def _step(point: Point, goal: ndarray) -> Point | None:
     """The largest part of a step that fits better; None where there is none.
 
-    No shorter step is tried where the parabola through the misfits of the last two and of the point
-    rises from the point on."""
+    Shorter steps are tried however much a longer one fails: the simulation may lose a window
+    beyond some size."""
     share = 1.0
-    longer = np.inf
     while share > 0.1:
         change = share * (goal - point.theta)
         if np.abs(change).max() <= SMALL_STEP:
             break
         trial = moved(point, point.theta + change)
-        rise = np.inf if trial is None else _misfit(trial) - _misfit(point)
-        if rise < 0.0:
+        if trial is not None and _misfit(trial) < _misfit(point):
             return trial
-        if 4.0 * rise - longer > 0.0:
-            break
-        longer = rise
         share /= 2.0
     return None
 

@@ -427,6 +427,7 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     level = np.array([1.0, 1.0, 0.0])
     plain = mirrored = 0.0
     turned = 0.0j
+    best: tuple[Samples, Samples] | None = None
     # attitude and accelerometer of one clock may be late beside the path
     for late in np.arange(-reach, reach + 0.5 * _DELAY_WARN, _DELAY_WARN):
         expected = level * rotate_back(attitude.attitudes(grid + late), force_w)
@@ -436,6 +437,8 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
         if max(abs(kept), abs(flipped)) > max(abs(turned), mirrored):
             turned, mirrored = kept, abs(flipped)
             best = Samples(grid, expected), Samples(grid, measured)
+    if best is None:  # nothing moves sideways
+        return None
     relation = relations.relate(*best, reach=_DELAY_BAD)
     correlation = min(max(abs(turned), mirrored), 0.999)
     nats = 0.5 * span / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - correlation**2))
