@@ -51,6 +51,11 @@ def with_channels(log: FlightLog, **channels: Channel) -> FlightLog:
     return FlightLog(log.channels | channels, log.meta)
 
 
+def asks(proposal, words: str) -> bool:
+    """Tell whether a question of a proposed mapping has these words."""
+    return any(words in question for question in proposal.questions)
+
+
 def upright(thrust: np.ndarray, heading=(1.0, 0.0, 0.0)) -> Rotation:
     """Attitudes with the third axis along a thrust and the first one nearest to ``heading``."""
     up = thrust / norm(thrust, axis=1, keepdims=True)

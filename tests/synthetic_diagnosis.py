@@ -12,6 +12,8 @@ from numpy.random import default_rng
 
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select import diagnose_flights
+from visthrow.diagnose.select.point import Point, Problem, linearise
+from visthrow.diagnose.select.selection import Selector
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
@@ -42,6 +44,18 @@ def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
 def explain_without_laws(model: Model) -> diagnose_flights.Diagnosis:
     """Explain flights by the effects of the catalogue alone."""
     return diagnose_flights.explain(model, laws=False)
+
+
+def linearised(model: Model) -> Point:
+    """Return a model's flights linearised where no effect acts."""
+    windows = model.windows({})
+    problem = Problem.of(model, windows, range(len(windows)))
+    return linearise(problem, np.zeros(len(model.effects)), windows=windows)
+
+
+def selector_of(model: Model) -> Selector:
+    """Return a search that has begun with a model's flights and looks for no laws."""
+    return Selector(linearised(model), 5.0, laws=False)
 
 
 def catalogue(count: int) -> tuple[Effect, ...]:

@@ -71,6 +71,11 @@ class Desk:
     def state(self):
         return self.status.connected, self.status.mode
 
+    def take_over(self, mode, *words):
+        """Let the pilot choose a mode, which a heartbeat says at once."""
+        self.fake.mode, self.fake._next_beat = mode, 0.0
+        self.turn(0.1, HOVER, *words)
+
     def release(self):
         self.backend.release(self.now)
 
@@ -154,8 +159,7 @@ def test_hands(kind):
     assert desk.state == (True, HOLD)
     desk.turn(1.6, HOVER, FOLLOW)
     assert desk.state == (True, FOLLOW)
-    desk.fake.mode, desk.fake._next_beat = (2 if kind == "ardupilot" else POSCTL), 0.0
-    desk.turn(0.1, HOVER, FOLLOW)
+    desk.take_over(2 if kind == "ardupilot" else POSCTL, FOLLOW)
     assert desk.state == (False, WAIT)
     assert "did not ask for: pilot or failsafe has it" in desk.status.note
     mode = desk.fake.mode
@@ -208,8 +212,7 @@ def test_px4_gives_the_vehicle_back_in_position_mode_where_the_config_says_so():
     desk.turn(0.3, HOVER, HOLD)
     assert (desk.status.connected, desk.status.mode, desk.fake.mode) == (True, HOLD, POSCTL)
     desk.turn(1.6, HOVER, FOLLOW)
-    desk.fake.mode, desk.fake._next_beat = POSCTL, 0.0
-    desk.turn(0.1, HOVER, FOLLOW)
+    desk.take_over(POSCTL, FOLLOW)
     assert not desk.status.connected, "unasked it is the pilot's"
 
 
@@ -217,8 +220,7 @@ def test_px4_in_position_mode_is_the_pilots_where_its_hold_was_requested():
     desk = Desk("px4").follow()
     desk.turn(0.5, HOVER, HOLD)
     assert desk.status.mode == HOLD
-    desk.fake.mode, desk.fake._next_beat = POSCTL, 0.0
-    desk.turn(0.1, HOVER)
+    desk.take_over(POSCTL)
     assert desk.status.mode != HOLD
 
 

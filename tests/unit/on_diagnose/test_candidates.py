@@ -8,10 +8,16 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue, explain_without_laws
+from tests.synthetic_diagnosis import (
+    EFFECTS,
+    SyntheticModel,
+    catalogue,
+    explain_without_laws,
+    linearised,
+)
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select import diagnose_flights, result
-from visthrow.diagnose.select.point import Problem, linearise, untracked_windows
+from visthrow.diagnose.select.point import untracked_windows
 
 NAME, SIZE = "effect_03", 10.0  # in floors
 BUMP = 0.3
@@ -140,12 +146,6 @@ class Spoiled(SyntheticModel):
         return self._spoilt(theta, super().residuals(theta, about))
 
 
-def lost_of(model) -> list[int]:
-    windows = model.windows({})
-    problem = Problem(model, tuple(range(len(windows))))
-    return untracked_windows(linearise(problem, np.zeros(len(model.effects)), windows=windows))
-
-
 @mark.parametrize(
     ("shaken", "rough", "expected"),
     [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])],
@@ -153,7 +153,7 @@ def lost_of(model) -> list[int]:
 def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected):
     model = Spoiled(throws=8, seed=4)
     model.shaken, model.rough = shaken, rough
-    assert lost_of(model) == expected
+    assert untracked_windows(linearised(model)) == expected
 
 
 def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():

@@ -56,11 +56,18 @@ def test_of_what_flights_hardly_show_no_size_is_claimed():
     weak = EFFECTS[7]
     weak = replace(weak, prior_sd=1e-6 * weak.floor, floor=1e-6 * weak.floor)
     effects = (*EFFECTS[:7], weak, *EFFECTS[8:])
-    model = SyntheticModel(effects=effects, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-    diagnosis = explain_without_laws(model)
+    diagnosis = explain_without_laws(world({"effect_05": 40.0}, effects=effects))
     assert diagnosis[weak.name].verdict == result.NOT_IDENTIFIABLE
     assert "hardly more than was known" in diagnosis[weak.name].sentence
     assert diagnosis["effect_01"].verdict != result.NOT_IDENTIFIABLE
+
+
+def world(truth, **options) -> SyntheticModel:
+    """Twelve flights of some effects."""
+    return SyntheticModel(truth=truth, throws=8, free=4, seed=2, **options)
+
+
+GAIN = result.ChannelGain("pos_w", "m", 0.02, 0.0101, 0.01, float("nan"), 0.5, 0.4, 0.6, ())
 
 
 def judged(monkeypatch, truth, same=(), **changes):
@@ -71,8 +78,7 @@ def judged(monkeypatch, truth, same=(), **changes):
         return replace(plain(*args), **changes)
 
     monkeypatch.setattr(held_out, "measure", measure)
-    model = SyntheticModel(truth=truth, same=dict(same), throws=8, free=4, seed=2)
-    return explain_without_laws(model)
+    return explain_without_laws(world(truth, same=dict(same)))
 
 
 @mark.parametrize(
@@ -94,7 +100,7 @@ def test_names_that_held_out_flights_do_not_confirm_are_none(
 def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(monkeypatch):
     """Here the names bring the nats that they promise, and no channel's error falls for sure."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
-    gain = result.ChannelGain("pos_w", "m", 0.02, 0.019, 0.01, float("nan"), 0.05, -0.1, 0.2, ())
+    gain = replace(GAIN, after=0.019, gain=0.05, low=-0.1, high=0.2)
     diagnosis = judged(monkeypatch, {"effect_05": 40.0}, channels=(gain,), folds=2)
     assert diagnosis["effect_05"].verdict == result.CANDIDATE
     assert "no channel's error falls for sure: pos_w 5 % [-10, 20]" in diagnosis.reasons[0]
@@ -117,7 +123,7 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
     """One flight alone holds it, such as a payload that was tracked once."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
     _, low, high = held_out.jackknifed(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
-    once = result.ChannelGain("one", "m", 0.02, 0.01, 0.01, float("nan"), 0.5, low, high, ())
+    once = replace(GAIN, channel="one", low=low, high=high)
     often = replace(once, channel="often", low=0.3, high=0.6)
     assert (once.interval, often.interval) == ("[no interval]", "[30, 60]")
     truth = {"effect_05": 40.0}
@@ -128,9 +134,7 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
 
 def test_nothing_is_named_over_an_interval_that_holds_zero():
     """Also where the evidence for it is overwhelming."""
-    diagnosis = explain_without_laws(
-        SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-    )
+    diagnosis = explain_without_laws(world({"effect_05": 40.0}))
     findings = [
         replace(f, low=-f.low, verdict=result.CANDIDATE) if f.name == "effect_05" else f
         for f in diagnosis.findings
@@ -149,12 +153,11 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
 def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     """Of two, the other keeps its name, with the size and interval that are printed."""
     truth, named_in = {"effect_05": 40.0, "effect_02": 40.0}, {"effect_05": 1.0, "effect_02": 2 / 3}
-    near = result.ChannelGain("pos_w", "m", 0.02, 0.0101, 0.01, float("nan"), 0.5, 0.4, 0.6, ())
-    far = replace(near, channel="quat_wb", after=0.027)
+    far = replace(GAIN, channel="quat_wb", after=0.027)
     for channels, error in (
-        ((near,), ", no residual above the noise"),
+        ((GAIN,), ", no residual above the noise"),
         (
-            (near, far),
+            (GAIN, far),
             "; on held-out flights the error of quat_wb is 2.7 times that of noise alone",
         ),
     ):
@@ -220,6 +223,5 @@ def test_several_forms_at_once_are_another_form(monkeypatch):
     for count in (1, 2):
         found = forms[:count], {}
         monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, found=found: found)
-        model = SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-        overall.append(explain_without_laws(model).overall)
+        overall.append(explain_without_laws(world({"effect_05": 40.0})).overall)
     assert overall == [result.KNOWN, result.UNKNOWN]

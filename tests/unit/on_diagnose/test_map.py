@@ -7,7 +7,7 @@ import pytest
 from pytest import approx, raises
 from scipy.spatial.transform import Rotation
 
-from tests.flightlogs import flight, log_at, log_of
+from tests.flightlogs import asks, flight, log_at, log_of
 from tests.places import DATA
 from tests.plants import paper_plant
 from visthrow.common.errors import DiagnoseError, LogError
@@ -95,9 +95,7 @@ def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
 def test_the_input_that_the_force_follows_drives_the_vehicle():
     columns = flight(20.0)
     thrust = columns["command"][:, 0]
-    table = {"time": columns["time"]} | named("pos", columns["pos_w"])
-    table |= {f"q{a}": c for a, c in zip("xyzw", columns["quat_wb"].T)}
-    table |= named("acc", columns["acc_b"]) | {f"motor{i}": thrust for i in range(1, 5)}
+    table = flown_by_motors(columns, thrust, "motor") | named("acc", columns["acc_b"])
     other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
     found = propose(table | {"thrust": other}, "a.csv")
     assert found.flyer["input"] == "motor_command"
@@ -105,7 +103,7 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     lift = 4.0 * found.flyer["thrust_map"][1] * hover
     assert lift == approx(9.81 * found.flyer["mass"], rel=0.1)
     assert found.flyer["drag_xy"] == approx(0.3 * found.flyer["mass"], rel=0.05)  # or no wind acts
-    assert any("The force follows 'motor_command' best" in q for q in found.questions)
+    assert asks(found, "The force follows 'motor_command' best")
 
 
 def test_a_marker_in_millimetres_is_no_velocity_of_another():
@@ -203,7 +201,7 @@ def test_rows_that_share_a_stamp_have_a_clock():
 def test_what_is_not_known_is_asked(tmp_path):
     columns = flight(20.0)
     found = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")
-    assert any("how far are the rows apart" in question for question in found.questions)
+    assert asks(found, "how far are the rows apart")
     with raises(LogError, match="none of its 2 columns holds numbers that change"):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
     with raises(LogError, match=r"a\.ulg: describes its own contents"):
@@ -265,7 +263,7 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
             slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv"
         )
         assert found.mapping.channels[0].unit == unit
-        assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
+        assert asks(found, f"'{unit}' is a guess") == asked
 
 
 def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
@@ -277,7 +275,7 @@ def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
     found = propose(columns, "a.csv")
     assert found.mapping.time.unit == "us"
     assert found.mapping.entry("vel_w").unit == "m/s"
-    assert any("fits the units us; 'us' is a guess" in q for q in found.questions)
+    assert asks(found, "fits the units us; 'us' is a guess")
     assert propose(columns, "a.csv", time_unit="ms").mapping.time.unit == "ms"
 
 
@@ -293,35 +291,26 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
         propose(table_of(file), file.name, mass=36.9)
     found = propose(table_of(file), file.name, mass=0.0369)
     assert "N by the mass: it carries 0.04077 kg" in found.why["thrust_command"]
-    assert not any("thrust" in question for question in found.questions)
+    assert not asks(found, "thrust")
     grams = table_of(file)
     grams["ctrlLee.thrustSI"] = grams["ctrlLee.thrustSI"] / UNITS["gf"][1]
     found = propose(grams, file.name, mass=0.0369)
     assert units_of(found)["thrust_command"] == "gf"
     assert found.flyer["thrust_map"] == [0.0, 1.0, 0.0]
     both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
-    assert any(
-        "36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?" in question
-        for question in both.questions
-    )
+    assert asks(both, "36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?")
     apart = {name: cells for name, cells in table_of(file).items() if not name.startswith("acc")}
     apart["ctrlLee.thrustSI"] = 1e3 * apart["ctrlLee.thrustSI"]
     strange = propose(apart, file.name, mass=4.0)
-    assert any("no unit explains that" in question for question in strange.questions)
+    assert asks(strange, "no unit explains that")
 
 
 def test_a_mass_that_nothing_can_doubt_is_asked_about():
     file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
     found = propose(table_of(file), file.name, mass=27.0)
-    assert any(
-        "the vehicle weighs 27 kg? Nothing in the log is in newtons" in question
-        for question in found.questions
-    )
+    assert asks(found, "the vehicle weighs 27 kg? Nothing in the log is in newtons")
     ball = REAL / "jugglebot_throws" / "session7.csv.gz"
-    assert any(
-        "--mass is not used" in question
-        for question in propose(table_of(ball), ball.name, mass=0.1).questions
-    )
+    assert asks(propose(table_of(ball), ball.name, mass=0.1), "--mass is not used")
 
 
 def named(stem: str, values: np.ndarray) -> dict[str, np.ndarray]:
@@ -483,7 +472,7 @@ def test_outputs_without_a_motor_are_left_out_and_what_drives_a_flap_is_asked_ab
         table[f"actuator_outputs[{i}]"] = 1500.0 + 100.0 * np.sin(i * columns["time"])
     found = propose(table, "a.csv")
     assert found.mapping.entry("motor_command") is None
-    assert any("which four of actuator_outputs[0]" in question for question in found.questions)
+    assert asks(found, "which four of actuator_outputs[0]")
 
 
 def test_a_component_may_stand_before_its_word():
@@ -508,9 +497,9 @@ def test_a_flag_is_no_number_of_a_flight():
     table = {"time": columns["time"]} | named("pos", columns["pos_w"])
     half = np.arange(len(columns["time"])) % 7 == 0
     table |= {"data_valid": half.astype(float), "tracking_valid": half.astype(float)}
-    assert not any("[table.split]" in question for question in propose(table, "a.csv").questions)
+    assert not asks(propose(table, "a.csv"), "[table.split]")
     found = propose(table | {"flight_id": half.astype(float)}, "a.csv")
-    assert any("'flight_id' has 2 values" in question for question in found.questions)
+    assert asks(found, "'flight_id' has 2 values")
 
 
 def test_a_thrust_in_shares_of_the_full_one_is_doubted():
@@ -519,4 +508,4 @@ def test_a_thrust_in_shares_of_the_full_one_is_doubted():
     table = flown_by_motors(columns, 0.7 + 0.0 * columns["time"], "motor")
     table["hover_thrust"] = 0.32 * columns["command"][:, 0]
     found = propose(table, "a.csv", mass=0.9)
-    assert any("or a share of the full thrust?" in question for question in found.questions)
+    assert asks(found, "or a share of the full thrust?")

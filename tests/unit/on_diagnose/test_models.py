@@ -22,7 +22,7 @@ from tests.commands import run_command
 from tests.flightlogs import level_log, log_at, with_channels
 from tests.places import DATA
 from tests.plants import paper_plant
-from tests.synthetic_diagnosis import explain_without_laws
+from tests.synthetic_diagnosis import explain_without_laws, selector_of
 from visthrow import config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -36,8 +36,6 @@ from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.reporting.diagnosis_report import summary
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import diagnose_flights, result
-from visthrow.diagnose.select.point import Problem, linearise
-from visthrow.diagnose.select.selection import Selector
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -296,9 +294,7 @@ class TestFlyer:
 
     def test_another_of_a_group_is_simulated_however_little_it_promises(self, monkeypatch):
         model = self.in_wind(monkeypatch, 0.3, drag=0.01, wind=4.0, noise=2e-3)
-        windows = model.windows({})
-        problem = Problem.of(model, windows, range(len(windows)))
-        selector = Selector(linearise(problem, np.zeros(len(model.effects))), 5.0, laws=False)
+        selector = selector_of(model)
         named = {c.name: c for c in selector.candidates}
         wind, tilt, gain = (
             frozenset({named[n]}) for n in ("wind_x", "frame_tilt_y", "thrust_gain")

@@ -118,16 +118,22 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
         assert 2.0 < curve.limit / curve.sizes[0] < 20.0
 
 
+SAME = {"effect_07": ("effect_03", 0.5)}
+
+
+def twins() -> SyntheticModel:
+    """Flights of an effect that another one acts like."""
+    return SyntheticModel(truth={"effect_03": 12.0}, same=SAME, seed=2)
+
+
 @fixture(scope="module")
 def degenerate():
-    same = {"effect_07": ("effect_03", 0.5)}
-    model = SyntheticModel(truth={"effect_03": 12.0}, same=same, seed=2)
-    return explain_without_laws(model)
+    return explain_without_laws(twins())
 
 
 def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     apart = SyntheticModel(truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
-    alike = SyntheticModel(same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9)
+    alike = SyntheticModel(same=SAME, throws=1, free=0, seed=9)
     aim = plan.PlanningGoal(degenerate)
     models = {"hover": alike, "circle": apart}
     told = [
@@ -184,9 +190,7 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
         frozenset(("effect_03", "effect_07"))
     }
     assert not plan.propose(plan.PlanningGoal(degenerate, ("effect_00",)), [])
-    model = SyntheticModel(
-        truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
-    )
+    model = twins()
     model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
     assert explain_without_laws(model)["effect_03"].verdict == result.FOUND
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark, raises
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws, selector_of
 from tests.unit.on_diagnose.test_scatter import chosen_of
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
@@ -16,8 +16,6 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import diagnose_flights, held_out, result
-from visthrow.diagnose.select.point import Problem, linearise
-from visthrow.diagnose.select.selection import Selector
 
 
 def sizes(model, diagnosis) -> dict[str, float]:
@@ -427,8 +425,7 @@ def test_a_set_that_was_the_best_before_stays_possible():
     model = SyntheticModel(truth={"effect_06": 15.0}, seed=4)
     for w in model._windows:  # hardly to be told from it
         w.effects[:, 8] = w.effects[:, 6] + 0.03 * w.effects[:, 3]
-    problem = Problem.of(model, model.windows({}), range(14))
-    selector = Selector(linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
+    selector = selector_of(model)
     twin = frozenset(c for c in selector.candidates if c.name == "effect_08")
     selector.run(twin)
     assert [step.named for step in selector.steps] == ["effect_06"]
@@ -445,8 +442,7 @@ def test_a_name_of_which_the_true_cause_leaves_nothing_is_dropped(monkeypatch):
     model = SyntheticModel(truth={"effect_06": 15.0}, seed=4)
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + w.effects[:, 3]
-    problem = Problem.of(model, model.windows({}), range(14))
-    selector = Selector(linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
+    selector = selector_of(model)
     by_name = {c.name: c for c in selector.candidates}
     stand_in = frozenset({by_name["effect_08"]})
     true = frozenset({by_name["effect_06"]})

@@ -17,7 +17,7 @@ from sim.effects.setting import AERODYNAMICS, generalise
 from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from tests.synthetic_diagnosis import explain_without_laws
+from tests.synthetic_diagnosis import explain_without_laws, linearised, selector_of
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors
@@ -26,8 +26,7 @@ from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select.diagnose_flights import explain
-from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.select.selection import Selector
+from visthrow.diagnose.select.point import curvature, moved
 from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -51,6 +50,11 @@ one.
 """
 
 
+def model_of(logs, *names: str, **options) -> ThrowModel:
+    """Return the model of the paper's plant with some effects."""
+    return ThrowModel(logs, paper_plant(), only=names, **options)
+
+
 def estimate(windows, keep):
     """Linear estimate of some effects and its deviation, initial states and latent forces
     integrated out.
@@ -72,7 +76,7 @@ def estimate(windows, keep):
 def planted():
     """A free flight and a throw of a plant with some effects, and the model that lacks them."""
     logs = fly(setting_with(PLANTED), noise=0.2, free=1, throws=1, seconds=2.0)
-    return logs, ThrowModel(logs, paper_plant(), only=list(PLANTED))
+    return logs, model_of(logs, *PLANTED)
 
 
 def test_planted_effects_are_recovered(planted):
@@ -112,7 +116,7 @@ def test_commands_of_another_unit_are_no_error(planted):
         command = log["command"]
         values = command.values * [101.97, 1.0, 1.0, 1.0]
         wrong.append(FlightLog({**log.channels, "command": replace(command, values=values)}))
-    windows = ThrowModel(wrong, paper_plant(), only=["mass_quad"]).windows({})
+    windows = model_of(wrong, "mass_quad").windows({})
     assert np.nanmax(np.abs(np.concatenate([w.residual for w in windows]))) > 100.0
 
 
@@ -160,10 +164,8 @@ def test_initial_states_follow_the_effects(planted):
     """A centre of mass elsewhere needs other rotors, integrators and attitudes to begin with, or a
     transient hides what it does.
     """
-    model = ThrowModel(planted[0], paper_plant(), only=["com_y"])
-    windows = model.windows({})
-    problem = Problem(model, tuple(range(len(windows))))
-    nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
+    model = model_of(planted[0], "com_y")
+    nominal, there = linearised(model), np.array([15.0])
     blind = {i: replace(w, effects=0.0 * w.effects) for i, w in nominal.about.windows.items()}
     fixed = replace(nominal, about=replace(nominal.about, windows=blind))  # its states stay behind
     follow, behind = (moved(point, there) for point in (nominal, fixed))
@@ -282,9 +284,7 @@ def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
         assert abs(found - size) < 0.1 * size + 4.0 * sd, (name, found, sd)
         assert sd < 0.4 * size, name
     projected = [FlightLog(log.channels, {"config": {"keypoints": "projection"}}) for log in logs]
-    blind = ThrowModel(
-        projected, paper_plant(), camera=camera, only=["plane_height", "camera_latency"]
-    )
+    blind = model_of(projected, "plane_height", "camera_latency", camera=camera)
     assert "keypoints" not in blind.channels
     visible = Priors.of(blind.effects, tuple(blind.channels)).visible
     assert {e.name for e, seen in zip(blind.effects, visible) if not seen} == {"camera_latency"}
@@ -292,7 +292,7 @@ def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
 
 def test_a_manoeuvre_is_planned_beside_a_camera(planted):
     camera = load_experiment("state").camera
-    model = ThrowModel(planted[0][:1], paper_plant(), camera=camera, only=["com_x", "camera_focal"])
+    model = model_of(planted[0][:1], "com_x", "camera_focal", camera=camera)
     after = SimpleNamespace(
         sigma=lambda channel: 1e-3, noise=SimpleNamespace(scale=np.ones(len(model.channels)))
     )
@@ -306,7 +306,7 @@ def test_a_manoeuvre_is_planned_beside_a_camera(planted):
 def test_mistakes_are_reported(planted):
     logs, _ = planted
     with raises(DiagnoseError, match="no effect '"):
-        ThrowModel(logs, paper_plant(), only=["no_such"])
+        model_of(logs, "no_such")
     with raises(DiagnoseError, match="command"):
         ThrowModel(
             [type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})],
@@ -335,10 +335,10 @@ def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
     """It was: with nothing hidden, thrust 0.7 % too high was named. The voltage tells."""
     names = ["thrust_gain", "air_density", "mass_quad"]
     logs = fly(setting_with({}), used=0.0, throws=0, seconds=2.6)
-    assert not explain_without_laws(ThrowModel(logs, paper_plant(), only=names)).theta
+    assert not explain_without_laws(model_of(logs, *names)).theta
     for log in logs:
         del log.channels["battery_voltage"]
-    model = ThrowModel(logs, paper_plant(), only=[*names, "battery_charge"])
+    model = model_of(logs, *names, "battery_charge")
     diagnosis = explain_without_laws(model)
     assert set(diagnosis.theta) == {"battery_charge"}
     found = diagnosis["battery_charge"]
@@ -349,20 +349,20 @@ def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
 
 def test_logs_without_the_voltage_beside_one_that_holds_it_are_counted():
     logs = fly(setting_with({}), throws=0, seconds=1.0)
-    assert not ThrowModel(logs, paper_plant(), only=["thrust_gain"]).notes
+    assert not model_of(logs, "thrust_gain").notes
     del logs[0].channels["battery_voltage"]
-    model = ThrowModel(logs, paper_plant(), only=["thrust_gain"])
+    model = model_of(logs, "thrust_gain")
     assert model.notes == (
         "1 of 2 logs hold no battery_voltage: the charge at their start is assumed",
     )
     with raises(DiagnoseError, match="battery_charge"):
-        ThrowModel(logs, paper_plant(), only=["battery_charge"])
+        model_of(logs, "battery_charge")
 
 
 def test_the_answer_counts_the_windows_that_are_left_out(monkeypatch):
     monkeypatch.setattr(cutting, "WINDOW_LIMIT", 2)
     logs = fly(setting_with({}), throws=0, seconds=2.0)
-    model = ThrowModel(logs, paper_plant(), only=["thrust_gain"])
+    model = model_of(logs, "thrust_gain")
     assert len(model.windows({})) == 2
     assert model.notes[0].startswith("2 of 6 windows are looked at")
 
@@ -412,15 +412,14 @@ def throw_logs():
 
 def test_gusts_do_not_take_the_place_of_states(throw_logs):
     calm, shaken = (
-        begun(ThrowModel(found, paper_plant(), only=["rope_length"]))
-        for found in (throw_logs, map(swayed, throw_logs))
+        begun(model_of(found, "rope_length")) for found in (throw_logs, map(swayed, throw_logs))
     )
     away = shaken["rate_b"] - calm["rate_b"]
     assert np.sqrt(np.mean(away**2)) < RATE_KEPT
 
 
 def test_states_do_not_depend_on_what_was_fitted_before(throw_logs):
-    model = ThrowModel(throw_logs, paper_plant(), only=["rope_length", "com_x"])
+    model = model_of(throw_logs, "rope_length", "com_x")
     theta = {"com_x": 5e-4}
     first = model.windows(theta)
     model.windows({"rope_length": 2e-3})
@@ -439,11 +438,8 @@ def bend(states) -> np.ndarray:
 
 def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():
     """It would whip, and what whips tells nothing of what is wrong."""
-    model = ThrowModel(
-        fly(setting_with({"rope_length": -6e-3}), noise=1.0, free=1, throws=0, seconds=3.0),
-        paper_plant(),
-        only=["rope_length"],
-    )
+    logs = fly(setting_with({"rope_length": -6e-3}), noise=1.0, free=1, throws=0, seconds=3.0)
+    model = model_of(logs, "rope_length")
     assert bend(begun(model)).max() < BENDING
 
 
@@ -454,7 +450,7 @@ ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 def test_lost_commands_are_found_beside_a_cause():
     setting = setting_with({"com_x": 0.003})
     logs = fly(setting, seed=4, free=1, throws=2, seconds=3.0, lost=SHARE)
-    diagnosis = explain(ThrowModel(logs, paper_plant(), only=ONLY))
+    diagnosis = explain(model_of(logs, *ONLY))
     (found,) = [share for share in diagnosis.scatter if share.found]
     assert (diagnosis.overall, diagnosis.named, found.name) == ("KNOWN", ("com_x",), dropped.NAME)
     assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
@@ -467,11 +463,8 @@ def test_lost_commands_are_found_where_one_window_of_all_shows_them():
     show none of 6 %.
     """
     logs = fly(setting_with({}), seed=7, free=1, throws=2, seconds=3.0, lost=0.06)
-    model = ThrowModel(logs, paper_plant(), only=ONLY)
-    windows = model.windows({})
-    problem = Problem.of(model, windows, range(len(windows)))
-    nominal = linearise(problem, np.zeros(len(ONLY)), windows=windows)
-    found = dropped.verdict(nominal, (), 5.0)
+    model = model_of(logs, *ONLY)
+    found = dropped.verdict(linearised(model), (), 5.0)
     assert found is not None
     assert found.found
     assert found.nats > 50.0
@@ -481,10 +474,8 @@ def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():
     """By a part of what the wind is worth, for both push steadily; a shifted mass does not."""
     logs = fly(setting_with({"wind_x": 0.3}), seed=3, free=1, throws=0, seconds=2.6)
     names = ["wind_x", "frame_tilt_y", "com_x"]
-    model = ThrowModel(logs, paper_plant(), only=names)
-    windows = model.windows({})
-    problem = Problem.of(model, windows, range(len(windows)))
-    selector = Selector(linearise(problem, np.zeros(len(names))), 5.0, laws=False)
+    model = model_of(logs, *names)
+    selector = selector_of(model)
     named = {c.name: frozenset({c}) for c in selector.candidates}
     selector.best = selector._try(selector.nominal, [named["wind_x"]])[0]
     assert selector._limit(named["frame_tilt_y"]) > 2.0 * STRONG

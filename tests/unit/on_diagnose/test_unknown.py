@@ -13,7 +13,13 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 from scipy.spatial.transform import Rotation
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue, explain_without_laws
+from tests.synthetic_diagnosis import (
+    EFFECTS,
+    SyntheticModel,
+    catalogue,
+    explain_without_laws,
+    linearised,
+)
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import with_latent_effects
@@ -23,7 +29,7 @@ from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, un
 from visthrow.diagnose.select import diagnose_flights, result, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
-from visthrow.diagnose.select.point import Problem, candidate, linearise
+from visthrow.diagnose.select.point import candidate
 from visthrow.diagnose.select.selection import Selector, Trial
 
 IN_THE_BODY = ("vehicle torque", laws.JOINT)
@@ -271,8 +277,7 @@ DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> Selector:
     """A selection that has come to some names and laws."""
-    problem = Problem(model, tuple(range(len(model._windows))))
-    point = linearise(problem, np.zeros(len(model.effects)))
+    point = linearised(model)
     if told:
         (point,) = terms.extended([point], [terms.as_effect(term, 0.1, 7.0) for term in told])
     columns = [*active, *range(len(model.effects), len(point.theta))]

@@ -320,12 +320,16 @@ def test_no_exception_leaves_the_runner():
     assert "in flight" in pilot.errors[0]
 
 
-def narrowed(pilot, high):
-    """From the recovery on the vehicle's fence ends so far ahead [m]: it is outside of it."""
-    tight = replace(pilot.params.fence, vehicle_high=(high, 2.5, 2.8))
+OUTSIDE = {"vehicle_high": (-0.5, 2.5, 2.8)}
+"""Bounds that the vehicle is beyond [m]."""
+
+
+def narrowed(pilot, state, bounds):
+    """Return what gives the fence other bounds [m] from a state on."""
+    tight = replace(pilot.params.fence, **bounds)
 
     def watch(time, decision):
-        if decision.state == "recover":
+        if decision.state == state:
             object.__setattr__(pilot.params, "fence", tight)
 
     return watch
@@ -337,7 +341,7 @@ def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
     It comes down at once, and says why.
     """
     pilot = runner(AT_ONCE, "throws=2")
-    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, "recover", OUTSIDE))
     safe(pilot, decisions)
     assert [state for state, _ in changes(decisions)][-4:] == ["throw", "recover", "land", "done"]
     assert when(decisions, "land") - when(decisions, "recover") <= 2 * TICK
@@ -348,7 +352,7 @@ def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
 
 def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     pilot = runner(NEVER, "states.throw=1.0")
-    decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
+    decisions = fly(pilot, 20.0, watch=narrowed(pilot, "recover", OUTSIDE))
     safe(pilot, decisions)
     assert dict(changes(decisions))["recover"] == "the policy did not release in time"
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
@@ -390,13 +394,7 @@ def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
 def test_a_release_outside_of_the_fence_is_refused():
     """The payload hangs outside of its own fence from the moment that the policy asks."""
     pilot = runner(AT_ONCE)
-    tight = replace(pilot.params.fence, payload_low=(-3.0, -3.0, 1.2))
-
-    def watch(time, decision):
-        if decision.state == "armed":
-            object.__setattr__(pilot.params, "fence", tight)
-
-    decisions = fly(pilot, 5.0, watch=watch)
+    decisions = fly(pilot, 5.0, watch=narrowed(pilot, "armed", {"payload_low": (-3.0, -3.0, 1.2)}))
     safe(pilot, decisions)
     assert not pilot.backend.release_times
 

@@ -4,6 +4,7 @@ import math
 import struct
 
 import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pytest import approx, fixture, mark
 
 from tests import logfiles
@@ -179,8 +180,6 @@ def test_rotor_speeds_of_escs_that_log_one_by_one(ardupilot):
 
 def write_tlog(path, more, local=True):
     """A .tlog of a vehicle that booted 100 s before; ``more`` makes messages of encoder and row."""
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
     mav, out = dialect.MAVLink(None, 1, 1), []
     for i in range(200):
         s = 0.02 * i
@@ -216,8 +215,6 @@ def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_f
 
 def test_a_ground_stations_heartbeat_is_not_the_vehicles(tmp_path):
     """The station is heard first, and is not armed."""
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
     path, station = (
         write_tlog(tmp_path / "a.tlog", lambda mav, i: []),
         dialect.MAVLink(None, 255, 0),
@@ -232,8 +229,6 @@ def test_a_ground_stations_heartbeat_is_not_the_vehicles(tmp_path):
 
 
 def test_another_senders_messages_are_left_out_by_name(tmp_path):
-    from pymavlink.dialects.v20 import ardupilotmega as dialect
-
     def more(mav, i):
         return [mav.sys_status_encode(0, 0, 0, 0, 15000, 0, 0, 0, 0, 0, 0, 0, 0)]
 

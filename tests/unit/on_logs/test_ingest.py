@@ -381,10 +381,6 @@ class TestTables:
             read_rows(tmp_path, rows, PLACE)
 
     def test_damaged_files(self, tmp_path):
-        path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
-        path.write_bytes(path.read_bytes()[:200])
-        with raises(LogError, match="cannot be read"):
-            read(path, mapping(PLACE))
         (tmp_path / "a.parquet").write_bytes(b"PAR1 no")
         with raises(LogError, match="parquet"):
             read(tmp_path / "a.parquet")
