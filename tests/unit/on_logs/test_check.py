@@ -26,7 +26,7 @@ from tests.flightlogs import (
 )
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
-from visthrow.diagnose.select.diagnose_flights import refused_of
+from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import relate
@@ -230,6 +230,16 @@ def test_a_late_attitude_refuses_a_log_by_the_velocity_that_follows_its_position
     (reason,) = contradictions(check(logs), VELOCITIES)
     assert "d(vel_w)/dt, quat_wb acc_b: the second is +" in reason
     assert "streams on clocks apart" in reason
+
+
+def test_a_contradiction_is_reported_before_a_model_is_built():
+    columns = flight()
+    columns["rate_b"] = columns["rate_b"] * 57.3
+
+    def build():
+        raise AssertionError("the model was built")
+
+    assert diagnose([log_of(columns)], build).overall == "DATA INCONSISTENT"
 
 
 def test_a_pose_stream_of_another_clock_is_reported():

@@ -93,6 +93,8 @@ def test_without_noise_it_is_the_truth():
     assert valid.all()
     found = places(layout, frame, valid, camera)
     assert_close(found[:, :2], offset, rtol=0, atol=2e-4)
+    measured, _ = goal_motion.measure_goal(layout, frame, valid, camera)
+    assert_close(measured, offset + frame[:, :2], rtol=0, atol=2e-4)
     assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
     assert (found[:, 5] == 1.0).all()
 
@@ -115,6 +117,8 @@ def test_what_is_not_visible_is_zero():
     valid[4:, 4:] = False
     found = places(layout, frame, valid, camera)
     assert found[:4, [0, 1, 5]].abs().max() == 0.0
+    _, weight = goal_motion.measure_goal(layout, frame, valid, camera)
+    assert (weight > 0.0).tolist() == [False] * 4 + [True] * 4
     assert found[4:, 2:5].abs().max() == 0.0
     assert (found[4:, 5] == 1.0).all()
     assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
