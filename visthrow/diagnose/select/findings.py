@@ -135,10 +135,15 @@ class Reading:
         """Return the odds of all sets that hold none of these effects against those that hold one,
         with the window's sets alone in question.
         """
-        weights = {True: 0.0, False: 0.0}
+        with_one = 0.0
+        without = 0.0
         for effects, nats in self.all_sets:
-            weights[not {*members}.isdisjoint(effects)] += float(np.exp(-nats))
-        return weights[False] / weights[True]
+            weight = float(np.exp(-nats))
+            if {*members}.isdisjoint(effects):
+                without += weight
+            else:
+                with_one += weight
+        return without / with_one
 
     def _named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
         """Return the verdict on a cause that the flights ask for; ``mean`` is in floors,
