@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.links.backends.autopilot import ARMED, CUSTOM
+from hil.links.backends.mavlink_autopilot import ARMED, CUSTOM
 from hil.links.facts import values
 from hil.links.mavlink_link import IGNORE_ATTITUDE, OUR_COMPONENT, OUR_SYSTEM
 from hil.links.pymav import mav

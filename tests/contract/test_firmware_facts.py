@@ -24,7 +24,7 @@ PLAIN |= {255, 256, 65535, 65536, 0xFFFFFFFF}
 CHOICES = {
     "hil/links/backends/__init__.py": "THRUST_SHORT",
     "hil/links/backends/audit.py": "ASK_AGAIN GIVE_UP GIVE_UP_OPTIONAL",
-    "hil/links/backends/autopilot.py": "ASK_AGAIN CONFIRMATION_TIME STREAM SERVO_NEAR",
+    "hil/links/backends/mavlink_autopilot.py": "ASK_AGAIN CONFIRMATION_TIME STREAM SERVO_NEAR",
     "hil/links/backends/base.py": "REPEAT",
     "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX ARRIVED KEEP_ALIVE OPEN_TIME"
     " ARM_LOW POLLS READ_BACK RATES_PERIOD RATES_TIME",

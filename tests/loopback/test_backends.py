@@ -10,9 +10,9 @@ from hil.check import AutopilotCheck
 from hil.control.loop import Loop
 from hil.control.state_machine import OperatorInput
 from hil.links.backends.ardupilot import BRAKE
-from hil.links.backends.autopilot import MOST_TEXTS
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.links.backends.betaflight import OPEN_TIME, STICKS
+from hil.links.backends.mavlink_autopilot import MOST_TEXTS
 from hil.links.pymav import mav
 from tests.fakes.fake_px4 import LAND as PX4_LAND
 from tests.fakes.fake_px4 import OFFBOARD, POSCTL, custom

@@ -15,8 +15,8 @@ import time
 from pytest import fixture, mark, skip
 
 from hil.links.backends import make_backend
-from hil.links.backends.autopilot import ARMED
 from hil.links.backends.base import FOLLOW, HOLD
+from hil.links.backends.mavlink_autopilot import ARMED
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.pymav import mav

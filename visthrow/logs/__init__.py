@@ -127,7 +127,7 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises LogError: it cannot be read, or its format needs no mapping.
     """
-    from visthrow.logs.readers import recordings, table
+    from visthrow.logs.readers import recordings, table_to_log
 
     path, ending = Path(path), Path(path).suffix.lower()
     bag = (path / BAG).is_file()
@@ -145,11 +145,11 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
             )
         raise _missing(path)
     if path.name.lower().endswith(TABLES):
-        return table.read_table(path)
+        return table_to_log.read_table(path)
     if bag or ending in recordings.READERS or recordings.is_card(path):
         return recordings.read_recording(path)
     if _is_text(path):  # .tum, .dat, .log, .asc, ...
-        return table.read_table(path)
+        return table_to_log.read_table(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS, *SELF_DESCRIBING))
     raise LogError(
         f"{path}: ending '{path.suffix}', and not text; expected one of {of_tables}, or a table in"
@@ -163,15 +163,15 @@ def _is_text(path: Path) -> bool:
 
 
 def _read_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    from visthrow.logs.readers import table
+    from visthrow.logs.readers import table_to_log
     from visthrow.logs.readers.blackbox import channels
 
     columns = table_of(path)
     if mapping is not None:
-        return table.logs_of(columns, mapping, str(path))
+        return table_to_log.logs_of(columns, mapping, str(path))
     if channels.is_decoded(columns):
         return [channels.log_of_decoded(columns, path)]
-    if (exported := table.log_of_export(columns, path)) is not None:
+    if (exported := table_to_log.log_of_export(columns, path)) is not None:
         return [exported]
     names = ", ".join(list(columns)[:12])
     raise LogError(

@@ -9,10 +9,10 @@ from typing import Any
 
 from hil.errors import RunError
 from hil.links.backends.ardupilot import ArduPilot
-from hil.links.backends.autopilot import MavlinkAutopilot
 from hil.links.backends.base import Backend, DryRun, Held
 from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.crazyflie import Crazyflie
+from hil.links.backends.mavlink_autopilot import MavlinkAutopilot
 from hil.links.backends.px4 import Px4
 from hil.links.backends.rates import Sticks
 from hil.links.crtp import open_crtp

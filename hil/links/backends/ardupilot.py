@@ -14,8 +14,8 @@ Source: `hil.links.facts`, ardupilot.toml."""
 from dataclasses import dataclass
 from typing import Literal
 
-from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND
+from hil.links.backends.mavlink_autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.facts import values
 from hil.links.pymav import mav
 from visthrow.common.errors import ConfigError

@@ -15,8 +15,8 @@ import struct
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND, Command
+from hil.links.backends.mavlink_autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.facts import values
 from hil.links.pymav import mav
 from visthrow.config.bounds import Bound

@@ -20,7 +20,7 @@ from visthrow.logs import read, table_of
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
-from visthrow.logs.readers.table import logs_of
+from visthrow.logs.readers.table_to_log import logs_of
 from visthrow.logs.unit_names import UNITS
 
 REAL = DATA / "real"

@@ -16,7 +16,7 @@ from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import FlightLog
-from visthrow.logs.readers import table
+from visthrow.logs.readers import table_to_log
 
 REAL = DATA / "real"
 FLIGHTS = (204, 205, 206)
@@ -147,9 +147,11 @@ def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
 )
 def test_spoiled_channels_are_refused(names, factor, words):
     chosen = setups.load("cf_payload")
-    columns = table.read_table(REAL / "payload_cf_single" / "log206.csv.gz")
+    columns = table_to_log.read_table(REAL / "payload_cf_single" / "log206.csv.gz")
     spoiled = {name: factor * columns[name] for name in names}
-    logs = [table.logs_of(one, chosen.table, "log206") for one in (columns, columns | spoiled)]
+    logs = [
+        table_to_log.logs_of(one, chosen.table, "log206") for one in (columns, columns | spoiled)
+    ]
     assert setups.model_of(chosen, logs[0]).stretches  # as it is, it can be looked at
     with raises(LogError, match=words):
         setups.model_of(chosen, logs[1])

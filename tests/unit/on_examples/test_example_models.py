@@ -22,7 +22,7 @@ from visthrow.diagnose.reporting.explain_cli import write_report
 from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.result import FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT
 from visthrow.logs.flightlog import FlightLog
-from visthrow.logs.readers import table
+from visthrow.logs.readers import table_to_log
 
 G = 9.81
 REAL = DATA / "real"
@@ -172,12 +172,12 @@ def test_the_camera_sees_the_load_nearer_the_axis():
 
 def swung(columns: dict) -> PendulumModel:
     mapping = setups.load("pendulum_encoder").table
-    return PendulumModel(table.logs_of(columns, mapping, "a table"), ENCODER)
+    return PendulumModel(table_to_log.logs_of(columns, mapping, "a table"), ENCODER)
 
 
 def filmed(columns: dict) -> GimbalModel:
     mapping = setups.load("slungload_camera").table
-    return GimbalModel(table.logs_of(columns, mapping, "a table"), SLUNG_LOAD)
+    return GimbalModel(table_to_log.logs_of(columns, mapping, "a table"), SLUNG_LOAD)
 
 
 @mark.parametrize(
@@ -195,7 +195,7 @@ def filmed(columns: dict) -> GimbalModel:
     ],
 )
 def test_spoiled_channels_are_refused(model, path, change, words):
-    columns = table.read_table(path)
+    columns = table_to_log.read_table(path)
     assert model(columns).stretches  # as it is, it can be looked at
     with raises(LogError, match=words):
         model(columns | change(columns))

@@ -14,7 +14,7 @@ from tests.flightlogs import asks
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.proposal import propose
 from visthrow.logs import table_of
-from visthrow.logs.readers.table import logs_of
+from visthrow.logs.readers.table_to_log import logs_of
 
 TIME = 0.01 * np.arange(400)
 YAW = 0.3

@@ -16,7 +16,7 @@ from visthrow.common.errors import LogError
 from visthrow.common.storage import savez
 from visthrow.logs import read
 from visthrow.logs.readers.recordings import read_recording
-from visthrow.logs.readers.table import read_table
+from visthrow.logs.readers.table_to_log import read_table
 
 ROWS = 140_000
 TEXT = b"time,x\n" + b"0.000,0.000\n" * ROWS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.toml_text import tables_beside
-from visthrow.logs.readers.table import Table
+from visthrow.logs.readers.table_to_log import Table
 from visthrow.logs.readers.text_table import unit_of
 from visthrow.logs.unit_names import UNITS
 

@@ -19,7 +19,7 @@ from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap, TimeColumn
-from visthrow.logs.readers.table import Table, logs_of
+from visthrow.logs.readers.table_to_log import Table, logs_of
 from visthrow.logs.unit_names import UNITS, fitting_units
 
 # of rotors, by mass; without any, wind would be named as a tilt (Faessler et al. 2018) [1/s]

@@ -23,7 +23,7 @@ from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import IDLE_PULSE
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.readers.table import lost_rows, make_channel
+from visthrow.logs.readers.table_to_log import lost_rows, make_channel
 from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 

@@ -16,7 +16,7 @@ from visthrow.logs.check import physics
 from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.readers.table import forward_rows
+from visthrow.logs.readers.table_to_log import forward_rows
 from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 

@@ -111,7 +111,7 @@ def _resolution(values: np.ndarray) -> np.ndarray:
 
 def look(name: str, channel: Channel, notes: dict) -> Iterator[Row]:
     """Yield the findings of all checks of one channel; ``notes``: what the reader left out; see
-    :func:`visthrow.logs.readers.table.make_channel`.
+    :func:`visthrow.logs.readers.table_to_log.make_channel`.
     """
     count = len(channel.time)
     span = np.ptp(channel.time) if count else 0.0

@@ -26,7 +26,7 @@ from visthrow.logs.readers.messages import (
     read_telemetry,
     read_ulog,
 )
-from visthrow.logs.readers.table import make_channel
+from visthrow.logs.readers.table_to_log import make_channel
 from visthrow.logs.readers.vehicles import Vehicle, vehicle_of
 
 NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike

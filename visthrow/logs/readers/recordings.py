@@ -27,7 +27,7 @@ import numpy as np
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import require_room
-from visthrow.logs.readers.table import Columns, Table
+from visthrow.logs.readers.table_to_log import Columns, Table
 
 # a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal;
 # a list of messages may hold a state of tens of numbers

@@ -14,7 +14,7 @@ from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
-from visthrow.logs.readers.table import Table, make_channel
+from visthrow.logs.readers.table_to_log import Table, make_channel
 
 TABLES = tables_beside(__file__)
 MOTOR_ORDER = (3, 1, 2, 0)
