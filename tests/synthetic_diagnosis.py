@@ -5,6 +5,7 @@ Vehicle and payload are moved by smooth random forces; positions of both are mea
 force shapes on either mass or shifts of a measured position, so the linearisation is exact unless
 ``curvature`` says otherwise. A hidden law acts at all times, not at the knots alone."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -239,3 +240,15 @@ class SyntheticModel(Model):
     ) -> list[np.ndarray]:
         sizes = self._sizes(theta)
         return [w.residual - self._answer(w.effects, sizes) for w in self._windows]
+
+
+def altered(change: Callable[[SyntheticModel, Window], Window], **options) -> SyntheticModel:
+    """Return flights after something was done to each of their windows."""
+    model = SyntheticModel(**options)
+    model._windows = [change(model, w) for w in model._windows]
+    return model
+
+
+def pushed(model: SyntheticModel, window: Window, **sizes: float) -> Window:
+    """Return a window in which effects of some sizes, in floors, act besides."""
+    return replace(window, residual=window.residual + model._answer(window.effects, sizes))

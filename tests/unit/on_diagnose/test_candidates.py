@@ -45,12 +45,8 @@ class Whipping(SyntheticModel):
         ]
 
 
-def explained(size: float):
-    return explain_without_laws(Whipping(truth={NAME: size}, seed=5))
-
-
 def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_leads():
-    diagnosis = explained(SIZE)
+    diagnosis = explain_without_laws(Whipping(truth={NAME: SIZE}, seed=5))
     assert diagnosis.named == (NAME,)
     assert diagnosis[NAME].estimate == approx(SIZE * EFFECTS[3].floor, rel=0.1)
     assert diagnosis.overall == result.KNOWN

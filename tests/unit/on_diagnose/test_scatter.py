@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
-from tests.synthetic_diagnosis import SyntheticModel, explain_without_laws
+from tests.synthetic_diagnosis import SyntheticModel, altered, explain_without_laws, pushed
 from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -191,25 +191,13 @@ DELAYED = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumer
 FLOOR = DELAYED[4].floor
 
 
-class Drawn(SyntheticModel):
-    """Flights each of which has its own size of one effect, in floors."""
-
-    sizes = ()
-
-    def __post_init__(self):
-        super().__post_init__()
-        self._windows = [
-            replace(
-                w,
-                residual=w.residual + self._answer(w.effects, {"cmd_delay": self.sizes[w.flight]}),
-            )
-            for w in self._windows
-        ]
-
-
 def drawn(sizes, **options) -> SyntheticModel:
-    return type("Own", (Drawn,), {"sizes": tuple(sizes)})(
-        effects=DELAYED, throws=len(sizes) - 1, free=1, **options
+    """Return flights each of which has its own size of one effect, in floors."""
+    return altered(
+        lambda m, w: pushed(m, w, cmd_delay=sizes[w.flight]),
+        effects=DELAYED,
+        throws=len(sizes) - 1,
+        **options,
     )
 
 

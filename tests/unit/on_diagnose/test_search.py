@@ -8,7 +8,14 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark, raises
 
-from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws, selector_of
+from tests.synthetic_diagnosis import (
+    EFFECTS,
+    SyntheticModel,
+    altered,
+    explain_without_laws,
+    pushed,
+    selector_of,
+)
 from tests.unit.on_diagnose.test_scatter import chosen_of
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
@@ -21,26 +28,6 @@ from visthrow.diagnose.select import diagnose_flights, held_out, result
 def sizes(model, diagnosis) -> dict[str, float]:
     floor = {e.name: e.floor for e in model.effects}
     return {name: value / floor[name] for name, value in diagnosis.theta.items()}
-
-
-class Altered(SyntheticModel):
-    """The same flights after something was done to their windows."""
-
-    change = staticmethod(lambda model, window: window)
-
-    def __post_init__(self):
-        super().__post_init__()
-        self._windows = [type(self).change(self, w) for w in self._windows]
-
-
-def altered(change, **options) -> SyntheticModel:
-    return type("Altered", (Altered,), {"change": staticmethod(change)})(**options)
-
-
-def pushed(model, window, size: float):
-    return replace(
-        window, residual=window.residual + model._answer(window.effects, {"effect_03": size})
-    )
 
 
 def test_nothing_is_found_where_nothing_is():
@@ -85,12 +72,7 @@ def hiding(own: float, **options) -> SyntheticModel:
     def change(model, window):
         columns = window.effects.copy()
         columns[:, 7] = own * columns[:, 7] - columns[:, 3]
-        window = replace(window, effects=columns)
-        return replace(
-            window,
-            residual=window.residual
-            + model._answer(columns, {"effect_03": 14.0, "effect_07": 14.0}),
-        )
+        return pushed(model, replace(window, effects=columns), effect_03=14.0, effect_07=14.0)
 
     return altered(change, seed=3, **options)
 
@@ -143,8 +125,7 @@ def test_two_causes_are_classes_with_one_that_stands_in_for_both():
         columns = window.effects.copy()
         both = floor[3] * columns[:, 3] + floor[4] * columns[:, 4]
         columns[:, 8] = both / floor[8] + 0.132 * columns[:, 8]
-        both = model._answer(columns, {"effect_03": 20.0, "effect_04": 20.0})
-        return replace(window, effects=columns, residual=window.residual + both)
+        return pushed(model, replace(window, effects=columns), effect_03=20.0, effect_04=20.0)
 
     diagnosis = explain_without_laws(altered(change, seed=3))
     assert [set(names) for names, _ in diagnosis.sets] == [
@@ -168,7 +149,7 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
 
 
 def test_what_happened_in_one_flight_is_an_event_and_no_cause():
-    model = altered(lambda m, w: pushed(m, w, 40.0) if w.flight == 4 else w, throws=9)
+    model = altered(lambda m, w: pushed(m, w, effect_03=40.0) if w.flight == 4 else w, throws=9)
     diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert diagnosis.events == (4,)
@@ -191,7 +172,7 @@ def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, ev
 
 
 def test_signs_that_change_from_flight_to_flight_are_reported_as_what_varies():
-    model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
+    model = altered(lambda m, w: pushed(m, w, effect_03=15.0 * (-1) ** w.flight), throws=9)
     diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [
@@ -202,7 +183,7 @@ def test_signs_that_change_from_flight_to_flight_are_reported_as_what_varies():
 
 def test_flights_that_differ_each_for_itself_leave_nothing_to_vary():
     sizes = (20.0, 0.0, 26.0, 0.0, 0.0, 20.0)
-    model = altered(lambda m, w: pushed(m, w, sizes[w.flight]), throws=5)
+    model = altered(lambda m, w: pushed(m, w, effect_03=sizes[w.flight]), throws=5)
     diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis.events == (0, 2, 5)
     assert diagnosis.overall == result.KNOWN

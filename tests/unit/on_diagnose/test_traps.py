@@ -11,6 +11,7 @@ from pytest import approx, mark, raises
 from bench.diagnose.altered import with_values
 from tests.flightlogs import with_channels
 from tests.places import DATA
+from tests.unit.on_logs.test_check import faults
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs.check.rows import KnownVehicle
@@ -42,10 +43,7 @@ def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
 
 
 def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
-    (checked,) = check([log], known)
-    return " | ".join(
-        f"{row.topic} {row.channel}: {row.text}" for row in checked.rows if row.verdict == "bad"
-    )
+    return faults(log, vehicle=known)
 
 
 @mark.parametrize("number", FLIGHTS)

@@ -46,6 +46,11 @@ def lines(rows, mark=",", comma=False):
     return out.getvalue().replace(".", ",") if comma else out.getvalue()
 
 
+def table_with(head, *columns):
+    """Text of a table of columns beside the time."""
+    return f"time,{head}\n{lines(np.column_stack([TIME, *columns]).tolist())}"
+
+
 def motive(version="1.23", scale=1.0, units="Meters", gap=slice(0, 0)):
     places = POS @ Y_UP.as_matrix().T * scale
     quats = (Y_UP * TURN * Y_UP.inv()).as_quat()
@@ -202,8 +207,8 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, proposed):
     pos, quat = POS.copy(), QUATS.copy()
     pos[200:260] = pos[199] if mode == "held" else 0.0
     quat[200:260] = {"all zero": [0, 0, 0, 0], "position zero": [0, 0, 0, 1]}.get(mode, quat[199])
-    rows = np.column_stack([TIME, pos, quat, POS - [0.0, 0.0, 0.5]]).tolist()
-    _, found, (log, *_) = proposed("time,x,y,z,qx,qy,qz,qw,px,py,pz\n" + lines(rows))
+    text = table_with("x,y,z,qx,qy,qz,qw,px,py,pz", pos, quat, POS - [0.0, 0.0, 0.5])
+    _, found, (log, *_) = proposed(text)
     assert "pos_w" in log
     if mode != "held":
         assert "payload_pos_w" in log
@@ -236,8 +241,7 @@ def test_angles_in_degrees_are_no_position(proposed):
     """Euler angles of an order that no name tells are left out and listed."""
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
-    rows = np.column_stack([TIME, angles, POS]).tolist()
-    _, found, _ = proposed(lines([["time", *names], *rows]))
+    _, found, _ = proposed(table_with(",".join(names), angles, POS))
     (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
     assert "quad.Rotation.X [deg]" in found.left_out
@@ -256,8 +260,7 @@ def test_what_nothing_checks_is_asked(head, proposed):
     rng = np.random.default_rng(0)
     rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
     acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
-    rows = np.column_stack([TIME, rates, acc]).tolist()
-    _, found, _ = proposed(f"time,{head}\n" + lines(rows))
+    _, found, _ = proposed(table_with(head, rates, acc))
     assert asks(found, ASKED[head])
 
 
@@ -267,17 +270,16 @@ def test_velocities_of_the_world_and_of_the_body_are_distinguished(frame, propos
     turn = Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
     vel = np.gradient(POS, TIME, axis=0)
     vel = vel if frame == "world" else turn.inv().apply(vel)
-    rows = np.column_stack([TIME, POS, turn.as_quat(), vel]).tolist()
-    _, found, _ = proposed("time,x,y,z,qx,qy,qz,qw,vx,vy,vz\n" + lines(rows))
+    text = table_with("x,y,z,qx,qy,qz,qw,vx,vy,vz", POS, turn.as_quat(), vel)
+    _, found, _ = proposed(text)
     names = {entry.name for entry in found.mapping.channels}
     assert ("vel_b" in names, "vel_w" in names) == (frame == "body", frame == "world")
 
 
 def test_rotor_speeds_are_proposed_as_speeds(proposed):
     speeds = 6000.0 + 100.0 * np.sin(np.outer(TIME, [1.0, 1.1, 1.2, 1.3]))
-    rows = np.column_stack([TIME, POS, speeds]).tolist()
     heads = {"rpm1,rpm2,rpm3,rpm4": "rpm", "m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]": "rad/s"}
     for head, unit in heads.items():
-        _, found, _ = proposed(f"time,x,y,z,{head}\n" + lines(rows))
+        _, found, _ = proposed(table_with(f"x,y,z,{head}", POS, speeds))
         (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
         assert entry.unit == unit

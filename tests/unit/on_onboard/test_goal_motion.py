@@ -12,6 +12,7 @@ from pytest import approx
 
 from camera.keypoints import KeypointCamera, keypoints
 from tests.configs import load_experiment
+from tests.unit.on_onboard.test_located import followed
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 
@@ -75,18 +76,13 @@ def test_a_located_state_layout_has_the_mean_goal():
     params = load_experiment("state").task.observation
     layout = ob.layout_of(replace(params, located=True))
     assert layout.dimension == ob.layout_of(params).dimension + 2
-    rng, goal = default_rng(1), np.array([1.5, -0.5])
-    sums, fresh, seen = goal_motion.empty_sums(1), torch.ones(1, dtype=torch.bool), []
-    for step in range(10):
-        frame = torch.zeros(1, layout.frame)
-        frame[0, :2] = torch.tensor(0.1 * rng.standard_normal(2))
-        seen.append(goal + 0.05 * rng.standard_normal(2))
-        frame[0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(seen[-1]) - frame[0, :2]
-        time = torch.full((1,), step * PERIOD)
-        sums, _, places, kept, _ = goal_motion.update_goal_fit(
-            layout, frame, None, None, sums, time, fresh
-        )
-        fresh = torch.zeros_like(fresh)
-        assert kept is frame
-        wanted = np.mean(seen, axis=0) - frame[0, :2].numpy()
-        assert_allclose(places[0].numpy(), wanted, atol=1e-5)
+    rng = default_rng(1)
+    places = 0.1 * rng.standard_normal((10, 2))
+    seen = [1.5, -0.5] + 0.05 * rng.standard_normal((10, 2))
+    frames = torch.zeros(10, 1, layout.frame)
+    frames[:, 0, :2] = torch.tensor(places)
+    frames[:, 0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(seen - places)
+    for step, found in enumerate(followed(layout, frames, None, None)):
+        assert torch.equal(found.frame, frames[step])
+        wanted = np.mean(seen[: step + 1], axis=0) - places[step]
+        assert_allclose(found.places[0].numpy(), wanted, atol=1e-5)

@@ -47,20 +47,28 @@ def places(layout, frame, valid, camera):
     )[2]
 
 
+def followed(layout, frames, valid, camera):
+    """Estimates of the goal over the frames of a throw."""
+    count = len(frames[0])
+    sums, fresh = goal_motion.empty_sums(count), torch.ones(count, dtype=torch.bool)
+    for k, frame in enumerate(frames):
+        time = torch.full((count,), 0.02 * k)
+        estimate = update_goal_fit(layout, frame, valid, camera, sums, time, fresh)
+        sums, fresh = estimate.sums, torch.zeros_like(fresh)
+        yield estimate
+
+
 def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     layout, camera, frame, valid, offset, _ = scene()
-    sums, fresh = goal_motion.empty_sums(8), torch.ones(8, dtype=torch.bool)
     off = []
-    for k in range(40):
-        noisy = frame + 0.01 * torch.randn_like(frame)
-        sums, _, found, _, _ = update_goal_fit(
-            layout, noisy, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
-        )
+    frames = [frame + 0.01 * torch.randn_like(frame) for _ in range(40)]
+    for noisy, estimate in zip(frames, followed(layout, frames, valid, camera)):
+        found = estimate.places
         off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
-        fresh = torch.zeros_like(fresh)
+    fresh = torch.zeros(8, dtype=torch.bool)
     assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
     _, _, blind, shown, counts = update_goal_fit(
-        layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh
+        layout, frame, torch.zeros_like(valid), camera, estimate.sums, torch.full((8,), 0.8), fresh
     )
     assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
     assert (blind[:, 5] == 1.0).all()
@@ -72,18 +80,10 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
 def test_a_goal_that_moves_is_where_it_is_now():
     layout, camera, frame, valid, offset, _ = scene()
     layout = replace(layout, motion=2)
-    sums, fresh, speed = (
-        goal_motion.empty_sums(8),
-        torch.ones(8, dtype=torch.bool),
-        torch.tensor([0.5, -0.3]),
-    )
-    for k in range(60):  # the vehicle moves with the goal: what it sees stays as it is
-        moved = frame.clone()
-        moved[:, :2] += speed * 0.02 * k
-        sums, velocity, found, _, _ = update_goal_fit(
-            layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
-        )
-        fresh = torch.zeros_like(fresh)
+    speed = torch.tensor([0.5, -0.3])
+    frames = frame.repeat(60, 1, 1)  # the vehicle moves with the goal: what it sees stays as it is
+    frames[:, :, :2] += 0.02 * torch.arange(60.0)[:, None, None] * speed
+    *_, (_, velocity, found, _, _) = followed(layout, frames, valid, camera)
     assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
     assert_close(found[:, :2], offset, rtol=0, atol=0.02)
 

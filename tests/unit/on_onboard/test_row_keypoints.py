@@ -19,6 +19,7 @@ LENSES = {
     "equidistant": {},
     "bent": {"k1": 0.01, "k2": -0.02, "k3": 0.003, "k4": 0.001},
     "larger than the sensor": {"width": 500, "cx": 230.0},
+    "at the payload": {},
 }
 
 
@@ -31,6 +32,8 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
         fisheye=replace(params.fisheye, **LENSES[lens]),
         noise=replace(params.noise, invalid_reads=reads),
     )
+    if lens == "at the payload":
+        params = replace(params, mount=replace(params.mount, position_b=(0.0, 0.0, 0.0)))
     camera = KeypointCamera(params)
     arrays = camera.on_arrays()
     rng = np.random.default_rng(0)
@@ -38,6 +41,8 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
     quat = rng.normal(size=(count, 4))
     pos = rng.normal(size=(count, 3)) + [0.0, 0.0, 2.0]
     payload = pos + 0.38 * rng.normal(size=(count, 3))
+    if lens == "at the payload":
+        payload[0] = pos[0]
     goal = rng.normal(size=(count, 3))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     views = [value.astype(np.float32) for value in (pos, quat, goal, payload)]
@@ -50,20 +55,3 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
     assert_array_equal(np.concatenate([seen_valid for _, seen_valid in seen]), valid)
     assert_allclose(np.concatenate([place for place, _ in seen]), points, rtol=0.0, atol=SINGLE)
     assert 0.1 < valid.float().mean() < 0.9, "points inside and outside of the field of view"
-
-
-@mark.parametrize("reads", ["zero", "edge"])
-def test_a_payload_at_the_lens_reads_as_in_the_batch(reads):
-    params = load_experiment("vision").camera
-    params = replace(
-        params,
-        mount=replace(params.mount, position_b=(0.0, 0.0, 0.0)),
-        noise=replace(params.noise, invalid_reads=reads),
-    )
-    camera = KeypointCamera(params)
-    pos = torch.tensor([[0.0, 0.0, 2.0]])
-    view = pos, torch.eye(3)[None], torch.tensor([[1.0, 0.5, 0.0]]), pos
-    points, valid = keypoints(camera, *view)
-    place, seen_valid = row_keypoints(camera.on_arrays(), *(value.numpy() for value in view))
-    assert_array_equal(seen_valid, valid)
-    assert_allclose(place, points, rtol=0.0, atol=SINGLE)

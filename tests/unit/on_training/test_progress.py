@@ -26,15 +26,20 @@ def clock(monkeypatch):
     return now
 
 
+def write_three(path, clock):
+    """Write a log of three iterations, of which the last one ends with throws."""
+    with progress.TrainLog(path, 1000, 10) as log:
+        for i in range(1, 4):
+            clock[0] += 10.0
+            log.row(FIGURES | {"iteration": i}, throws() if i == 3 else None)
+
+
 def rows_of(path):
     return list(csv.DictReader(path.open()))
 
 
 def test_the_lines_show_errors_landings_and_the_time_left(tmp_path, clock, capsys):
-    with progress.TrainLog(tmp_path / "p.csv", 1000, 10) as log:
-        for i in range(1, 4):
-            clock[0] += 10.0
-            log.row(FIGURES | {"iteration": i}, throws() if i == 3 else None)
+    write_three(tmp_path / "p.csv", clock)
     (line,) = capsys.readouterr().out.splitlines()
     assert "1:10 left" in line  # seven iterations of ten seconds
     assert "0.0500 m, 1.000 s, landed 66.7 %" in line
@@ -43,10 +48,7 @@ def test_the_lines_show_errors_landings_and_the_time_left(tmp_path, clock, capsy
 
 
 def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, clock, capsys):
-    with progress.TrainLog(tmp_path / "p.csv", 1000, 10) as log:
-        for i in range(1, 4):
-            clock[0] += 10.0
-            log.row(FIGURES | {"iteration": i})
+    write_three(tmp_path / "p.csv", clock)
     with progress.TrainLog(tmp_path / "p.csv", 1000, 10, done=2, minutes=1.0) as log:
         clock[0] += 10.0
         log.row(FIGURES | {"iteration": 3}, throws())
@@ -58,6 +60,6 @@ def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, cl
         (3, 30.0),
         (4, 90.0),
     ]
-    before, after = capsys.readouterr().out.splitlines()
+    _, before, after = capsys.readouterr().out.splitlines()
     assert "0:50 left" in before  # the minute ends before the seven iterations
     assert ", 0:00:00 left" in after
