@@ -1,5 +1,5 @@
-"""The release of a throw: latched once, separated a known lag later; its landing is found in the
-payload's poses.
+"""A release once it is commanded: latched once, separated a known lag later; its landing is found
+in the payload's poses. `hil.control.tick.commander` judges and commands it.
 """
 
 import math

@@ -1,4 +1,6 @@
-"""Act: the last step of a tick, from the decided state to commands and releases."""
+"""Act: the last step of a tick, from the decided state to commands. Judges a release that the policy
+asks for, and commands it.
+"""
 
 import copy
 import math

@@ -1,4 +1,4 @@
-"""Decide: the second step of a tick, from what is known to the state that is acted in."""
+"""Decide: the second step of a tick, from the estimate to the state of the run."""
 
 from collections import deque
 
