@@ -1,5 +1,5 @@
-"""Act: the last step of a tick, from the decided state to commands. Judges a release that the policy
-asks for, and commands it.
+"""Act: the last step of a tick, from the decided state to commands. Judges a release that the
+policy asks for, and commands it.
 """
 
 import copy
