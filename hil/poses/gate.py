@@ -31,7 +31,7 @@ RARE = 3  # gaps longer than ``hold`` in a row that count as no poses at all
 REASONS = {
     "invalid": "the source says that it does not see the body",
     "finite": "NaN or infinite numbers",
-    "attitude": "attitudes of NaN instead of unit quaternions: the source tells none",
+    "attitude": "attitudes of NaN instead of unit quaternions: the source gives none",
     "stamp": "stamps that are no time",
     "quaternion": "attitudes that are no unit quaternions",
     "old": "stamps not after the last one's: reordered, or not stamped",
@@ -156,7 +156,7 @@ class Gate:
         p = self.params
         if not pose.valid:
             return "invalid"
-        # First: without it, no number is known that the source gives in the body's axes.
+        # Checked first: without an attitude, numbers in the body's axes are NaN as well.
         if not all(map(math.isfinite, pose.quat or ())):
             return "attitude"
         numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.vel or ()), *(pose.rate or ()))

@@ -16,7 +16,7 @@ def tables_beside(module: str, name: str = "") -> dict[str, Any]:
 def dumps(tree: dict[str, Any]) -> str:
     """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values.
 
-    ValueError for a value that TOML has no form for, such as None."""
+    Raises ValueError for a value without a form in TOML, such as None."""
     import tomlkit
 
     return tomlkit.dumps(tree)

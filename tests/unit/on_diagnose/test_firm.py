@@ -142,7 +142,10 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
     wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
     assert (wide.overall, dict(wide.theta)) == (result.UNKNOWN, {})
     assert wide["effect_05"].verdict == result.CANDIDATE
-    assert "intervals hold 0" in wide.reasons[0]
+    assert "interval holds 0" in wide.reasons[0]
+    rivals = [replace(f, low=abs(f.low)) for f in findings]
+    rivalled = held_out.judged(replace(diagnosis, findings=tuple(rivals)))
+    assert "sets of causes without them" in rivalled.reasons[0]
     assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
     findings = [replace(f, nats=-1.0) if f.name == "effect_05" else f for f in findings]
     unasked = held_out.judged(replace(diagnosis, findings=tuple(findings)))["effect_05"]

@@ -118,15 +118,15 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     the setup's model is of no vehicle."""
     size = defaultdict(float, zip(result.names, map(float, result.theta)))
     if setup.flyer is not None:
-        return _fit_flyer(setup.flyer, size, base)
+        return _vehicle_of_flyer(setup.flyer, size, base)
     if setup.stand is not None:
-        return _fit_stand(setup.stand, size, result.middle_speed, base)
+        return _vehicle_of_stand(setup.stand, size, result.middle_speed, base)
     raise DiagnoseError(
         f"'{setup.about}' is neither a vehicle nor a motor; use a setup with [flyer] or [stand]"
     )
 
 
-def _fit_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
+def _vehicle_of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
     gain = 1.0 + size["thrust_gain"]
     mass = p.mass + size["mass_quad"]
     drag_xy = p.drag_xy + size["rotor_drag_xy"]
@@ -157,7 +157,7 @@ def _fit_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicl
     return changed(base, values)
 
 
-def _fit_stand(
+def _vehicle_of_stand(
     p: Any, size: Mapping[str, float], middle: float, base: VehicleParams
 ) -> VehicleParams:
     values = {

@@ -128,7 +128,7 @@ def correlations(
     residuals = parallel_map(residual_after_fit, free, fits)
     correlations_of: dict[int, Correlation] = {}
     for channel in range(channels):
-        scale = _is_suspect(free, residuals, channel)
+        scale = _suspect_deviation(free, residuals, channel)
         if scale is None:
             continue
         best, nats = _likeliest(free, channels, correlations_of, channel, scale)
@@ -151,7 +151,7 @@ def _free_effects(window: Window, slabs: ndarray) -> Window:
     return replace(window, nuisance=states, nuisance_sd=deviations, effects=none)
 
 
-def _is_suspect(
+def _suspect_deviation(
     windows: Sequence[Window], residuals: Sequence[ndarray], channel: int
 ) -> float | None:
     """Return the deviation of a channel's residual as a multiple of the stated one; None where

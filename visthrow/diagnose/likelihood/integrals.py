@@ -75,7 +75,7 @@ def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray
     blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales
     share with the fitted columns is given to the channels by their part in them."""
 
-    parts = parallel_map(_looked, grams, _shapes(grams, noise))
+    parts = parallel_map(_evaluate, grams, _shapes(grams, noise))
     return tuple(map(np.array, zip(*parts)))
 
 
@@ -116,7 +116,7 @@ def _factor(normal: ndarray, gram: Gram) -> ndarray:
     raise DiagnoseError(f"{where}: the normal equations are singular")
 
 
-def _looked(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
+def _evaluate(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
     """Return value, gradient and curvature by [blocks, scales]."""
     inner = _inner(gram)
     covariance = shape.root.T @ shape.root

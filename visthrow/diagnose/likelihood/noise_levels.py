@@ -287,7 +287,7 @@ def _likelihood(
     values, slopes, curvatures = look(grams, noise)
     places = layout.places
     # a share moves a window as its phase's level does
-    moved = np.r_[: slopes.shape[1], : noise.share.shape[1]]
+    moved = np.append(np.arange(slopes.shape[1]), np.arange(noise.share.shape[1]))
     slope = np.zeros(places.max() + 1)
     np.add.at(slope, places, slopes[:, moved])
     curvature = np.zeros((len(slope), len(slope)))

@@ -137,11 +137,11 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
         inner = np.tensordot(weight, gram.inner, 1)
         free = [*range(gram.nuisances), *(gram.hidden + k for k in free_effects)]
         columns = gram.hidden + np.asarray(effects, dtype=int)
-        known = _explained_share(inner, free, columns)
+        known = _explained_squares(inner, free, columns)
         total += inner[columns, columns] - known
         for block in np.unique(gram.latent_block):
             latents = gram.nuisances + np.flatnonzero(gram.latent_block == block)
-            explained = _explained_share(inner, [*free, *latents], columns)
+            explained = _explained_squares(inner, [*free, *latents], columns)
             by_block[LATENT_BLOCKS[block]] += explained - known
     blocks = []
     for i, whole in enumerate(total):
@@ -151,7 +151,7 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
     return blocks
 
 
-def _explained_share(inner: ndarray, basis: Sequence[int], columns: ndarray) -> ndarray:
+def _explained_squares(inner: ndarray, basis: Sequence[int], columns: ndarray) -> ndarray:
     """Parts of columns' squares that other columns explain.
 
     ``inner``: inner products of all, shape (P, P); ``basis``: numbers of the others.

@@ -272,12 +272,15 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     """A diagnosis as held-out flights leave it."""
     if diagnosis.overall == result.NO_EFFECT:
         return _innovations(diagnosis)
-    unsure = [n for n in diagnosis.theta if diagnosis[n].verdict == result.CANDIDATE]
+    spanning = [n for n in diagnosis.theta if diagnosis[n].low <= 0.0 <= diagnosis[n].high]
+    reason = f"{', '.join(spanning)}: every interval holds 0"
+    diagnosis = _withdrawn(diagnosis, Doubt(spanning, why="its interval holds 0", reason=reason))
+    rivalled = [n for n in diagnosis.theta if diagnosis[n].verdict == result.CANDIDATE]
+    why = "sets of causes without it explain these flights nearly as well"
     reason = (
-        f"{', '.join(unsure)}: intervals hold 0, or sets of causes without them explain these"
-        " flights nearly as well"
+        f"{', '.join(rivalled)}: sets of causes without them explain these flights nearly as well"
     )
-    diagnosis = _withdrawn(diagnosis, Doubt(unsure, why="its class is not sure", reason=reason))
+    diagnosis = _withdrawn(diagnosis, Doubt(rivalled, why=why, reason=reason))
     while diagnosis.theta and diagnosis.overall in (result.KNOWN, result.UNKNOWN):
         diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
         diagnosis = replace(diagnosis, held_out=measure(diagnosis))

@@ -4,6 +4,7 @@ Onboard-safe.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -410,11 +411,27 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
-def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
-    """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
-    feel drag and cable alone; z, which feels the thrust, is left out.
+@dataclass(frozen=True)
+class _LevelForces:
+    """How level forces by an accelerometer lie beside those by a path, at the delay at which they
+    go together best.
     """
-    span = np.ptp(acc.time)
+
+    plain: float  # largest correlation as they are, at any delay
+    turned: complex  # size: correlation where they are turned; angle: by which
+    mirrored: float  # correlation with their mirror image
+    relation: relations.Relation | None  # between both
+
+    @property
+    def correlation(self) -> float:
+        """Correlation where they are turned or mirrored, kept below 1."""
+        return min(max(abs(self.turned), self.mirrored), 0.999)
+
+
+def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelForces | None:
+    """Compare level forces at delays of an attitude and an accelerometer of one clock, which may be
+    late beside the path; None where too few samples are known, or nothing moves sideways.
+    """
     reach = 2.0 * _DELAY_BAD  # half of that refuses a log
     first = force_b.time[0] + _SPAN + reach
     last = force_b.time[-1] - _SPAN - reach
@@ -425,32 +442,46 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     grid = acc.time[known]
     force_w = acc.values[known] + _UP
     level = np.array([1.0, 1.0, 0.0])
-    plain = mirrored = 0.0
+    plain = 0.0
+    mirrored = 0.0
     turned = 0.0j
     best: tuple[Samples, Samples] | None = None
-    # attitude and accelerometer of one clock may be late beside the path
     for late in np.arange(-reach, reach + 0.5 * _DELAY_WARN, _DELAY_WARN):
         expected = level * rotate_back(attitude.attitudes(grid + late), force_w)
         measured = level * force_b.mean_over(grid + late, 2.0 * _SPAN)
         kept, flipped = _level_correlations(expected, measured)
         plain = max(plain, kept.real)
         if max(abs(kept), abs(flipped)) > max(abs(turned), mirrored):
-            turned, mirrored = kept, abs(flipped)
+            turned = kept
+            mirrored = abs(flipped)
             best = Samples(grid, expected), Samples(grid, measured)
-    if best is None:  # nothing moves sideways
+    if best is None:
         return None
-    relation = relations.relate(*best, reach=_DELAY_BAD)
-    correlation = min(max(abs(turned), mirrored), 0.999)
-    nats = 0.5 * span / relations.INDEPENDENT * np.log((1.0 - plain**2) / (1.0 - correlation**2))
+    return _LevelForces(plain, turned, mirrored, relations.relate(*best, reach=_DELAY_BAD))
+
+
+def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
+    """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
+    feel drag and cable alone; z, which feels the thrust, is left out.
+    """
+    forces = _compare_level(acc, attitude, force_b)
+    if forces is None or forces.relation is None:
+        return None
+    relation = forces.relation
+    plain = forces.plain
+    correlation = forces.correlation
+    samples = np.ptp(acc.time) / relations.INDEPENDENT
+    nats = 0.5 * samples * np.log((1.0 - plain**2) / (1.0 - correlation**2))
     nats -= np.log(len(EXCHANGES))  # an angle is a choice like that among exchanges
     surely = nats > _NATS and correlation > max(_CORRELATED, plain + CLEARLY)
-    if relation is None or not surely:
+    if not surely:
         return None
-    angle = np.degrees(np.angle(turned))
-    quarters = abs(angle - 90.0 * round(angle / 90.0))
-    is_mirror_image = mirrored > abs(turned)
+    angle = np.degrees(np.angle(forces.turned))
+    off_quarter = abs(angle - 90.0 * round(angle / 90.0))
+    is_quarter = off_quarter < 0.5 * TURNED < abs(angle)
+    is_mirror_image = forces.mirrored > abs(forces.turned)
     # axes that are exchanged do not correlate as they are
-    if plain < BELONGS and (is_mirror_image or quarters < 0.5 * TURNED < abs(angle)):
+    if plain < BELONGS and (is_mirror_image or is_quarter):
         figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
         return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
     if is_mirror_image or abs(angle) < TURNED:
