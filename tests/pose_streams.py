@@ -87,7 +87,7 @@ STREAMS = {
     ),
     "backward": PoseStream("stamps run backward, from", restamped(lambda s: 1e9 - s[1])),
     "ahead": PoseStream("stamps advance by 1e+03 s in a second", restamped(lambda s: 1e3 * s[1])),
-    "nan": PoseStream("NaN instead of unit quaternions: the source tells", quat=(math.nan,) * 4),
+    "nan": PoseStream("NaN instead of unit quaternions: the source gives", quat=(math.nan,) * 4),
     "no quaternion": PoseStream("no good pose of the vehicle", quat=(0.0,) * 4),
     "frame": PoseStream("frame LOCAL_FLU is not taken", frame=mav.MAV_FRAME_LOCAL_FLU),
     "quality": PoseStream("the source says that it does not see the body)", quality=-1),

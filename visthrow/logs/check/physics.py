@@ -413,8 +413,8 @@ def sparse(time: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class _LevelForces:
-    """How level forces by an accelerometer lie beside those by a path, at the delay at which they
-    go together best.
+    """Correlations of level forces by an accelerometer with those by a path, at the delay at which
+    they go together best.
     """
 
     plain: float  # largest correlation as they are, at any delay
