@@ -135,9 +135,9 @@ class DetectorView:
         noise = self._params.noise
         mounts = self._extrinsics()
         points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, mounts)
-        if noise.seen_radius < 1.0:
+        if noise.visible_radius < 1.0:
             distance = points.square().sum(-1)
-            valid = valid & (distance <= noise.seen_radius**2)
+            valid = valid & (distance <= noise.visible_radius**2)
         if noise.scale_std > 0.0:
             points = points * (1.0 + buffers["scale_error"])
         if noise.latency > 0.0:

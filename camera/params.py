@@ -123,7 +123,7 @@ class KeypointNoiseParams(BoundedFields):
     held_probability: Share = 0.0  # per step that the last image's keypoints come again [-]
     scale_std: NotNegative = 0.0  # Gaussian per episode: relative error of the focal length [-]
     # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
-    seen_radius: Annotated[float, Bound(0.0, 1.0, "(]")] = 1.0
+    visible_radius: Annotated[float, Bound(0.0, 1.0, "(]")] = 1.0
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property

@@ -43,7 +43,7 @@ VEHICLE = 15
 RESPONSE = 10
 """Width of one earlier step of a vehicle's response."""
 
-SETUPS = {"none": 0, "told": 4, "exact": 24}
+SETUPS = {"none": 0, "given": 4, "exact": 24}
 """Widths of a vehicle's set-up, by what ``setup`` says."""
 
 LOCATED = {"state": 2, "vision": 6}

@@ -38,7 +38,7 @@ def row_keypoints(
     rays_c = [*corners_c, *_outline(camera, ball_c)]
     marks = [_project(lens, *ray_c) for ray_c in rays_c]
     points = np.array([[(u, v) for u, v, _ in marks]])
-    valid = np.array([[seen for _, _, seen in marks]])
+    valid = np.array([[visible for _, _, visible in marks]])
     if not lens.circle_inside_image:
         valid &= lens.is_on_sensor(lens.denormalize(points))
     points[:, GOAL_KEYPOINTS:] = box_midpoints(points[:, GOAL_KEYPOINTS:])

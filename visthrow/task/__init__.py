@@ -70,7 +70,7 @@ class ObservationParams(Bounded):
     # answers
     response: int = 0
     # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
-    setup: Literal["none", "told", "exact"] = "none"
+    setup: Literal["none", "given", "exact"] = "none"
 
     @property
     def oldest(self) -> float:

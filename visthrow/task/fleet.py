@@ -10,7 +10,7 @@ A vision policy's camera is stated in these units too: on a vehicle with a rope 
 lens is twice as far from its middle, and the square on the ground twice as wide. The ball has its
 own size.
 
-The actor is given a vehicle's set-up, ``told``: the throttle that holds it in hover, the share of
+The actor is given a vehicle's set-up, ``given``: the throttle that holds it in hover, the share of
 what hangs in the total mass, the lag of the release, and the unit of time [s], by which links and
 sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody knows on board: an upper
 bound, and what the critic is given."""
@@ -105,7 +105,7 @@ class Member:
 
     def setup(self, kind: str) -> list[float]:
         """Return the set-up of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
-        return {"none": [], "told": self.given_setup, "exact": self.exact}[kind]
+        return {"none": [], "given": self.given_setup, "exact": self.exact}[kind]
 
 
 def members(experiment: Experiment) -> list[Member]:
@@ -175,7 +175,7 @@ def specialised(
     ):
         raise PolicyError(
             "policy with a contract of one vehicle; expected one that was trained for a fleet, with"
-            " setup told"
+            " setup given"
         )
     one = alone(experiment, number)
     chosen = members(experiment)[number]

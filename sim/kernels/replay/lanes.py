@@ -29,7 +29,7 @@ class Replayed:
     (rotation vector [rad]) in turns, payload [m], rate [rad/s]. The rest is undefined. ``ends`` and
     ``knots`` are empty where no lane keeps."""
 
-    seen: ndarray  # shape (rows, lanes, 3)
+    samples: ndarray  # shape (rows, lanes, 3)
     # states at the end of the windows of lanes that keep, as ``starts``; others undefined
     ends: dict[str, ndarray]
     # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``

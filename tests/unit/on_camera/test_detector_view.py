@@ -56,7 +56,7 @@ def test_keypoints_beyond_the_radius_that_a_detector_sees_are_invalid():
     assert bool(valid.all())
     radius = points.norm(dim=-1)[0]
     middle = float(radius.sort().values[3:5].mean())
-    _, valid = look(view_of(seen_radius=middle))
+    _, valid = look(view_of(visible_radius=middle))
     assert_array_equal(valid[0].numpy(), (radius <= middle).numpy())
 
 

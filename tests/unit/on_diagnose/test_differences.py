@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.random import default_rng
 
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Posterior, Priors
+from visthrow.diagnose.likelihood.evidence import MODEL_ERROR_FLOOR, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import allowed, between_flights
 
@@ -40,7 +40,7 @@ def interval(statistics: Statistics) -> tuple[float, float]:
     size = spread[0] @ posterior.score
     unlike, kept = between_flights(statistics, PRIORS, [0], np.array([size, 0.0]))
     more = unlike * kept[0] * allowed(size) ** 2
-    return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)
+    return size, np.sqrt(spread[0, 0] + MODEL_ERROR_FLOOR**2 + more)
 
 
 def test_intervals_hold_where_flights_differ_by_what_the_prior_says():

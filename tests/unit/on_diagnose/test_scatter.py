@@ -22,8 +22,8 @@ from visthrow.diagnose.select.candidates import (
     NOTHING,
     Candidate,
     Scatter,
+    estimate_shares,
     freed,
-    own_shares,
     random_shares,
     relinearised_per_flight,
     shared,
@@ -141,7 +141,7 @@ def test_shares_of_days_come_before_those_of_flights():
     statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
     moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
     statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
-    shares = own_shares(
+    shares = estimate_shares(
         statistics, np.zeros(len(NAMES)), share(0, FLIGHT, 1.0) | share(0, DAY, 10.0), days
     )
     assert_allclose(shares[:, 0], moved, atol=0.5)

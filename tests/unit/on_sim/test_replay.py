@@ -115,7 +115,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
     flown = engine.run(
         start, Recording({k: one(v) for k, v in windows.items()}, data), lanes, 0.1, 9
     )
-    out = flown.seen
+    out = flown.samples
     return {
         "pos": out[0 : 2 * n : 2],
         "turn": out[1 : 2 * n : 2],

@@ -11,7 +11,7 @@ with information I and scores s about theta = 0.
 
 Eight constants take part in what is named and what is said of it; all stand here. Whatever else a
 decision is compared with follows from them, from the catalogue's floors and from the 5 mm of
-landing behind these. 34 worlds were judged alike with ``OWN_FLOOR`` at half and double, ``INEXACT``
+landing behind these. 34 worlds were judged alike with ``MODEL_ERROR_FLOOR`` at half and double, ``INEXACT``
 at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and 4, ``LOST_SHARE`` at 0.1 and 0.25, one at a time
 (``bench.diagnose.constants``). Other modules' constants say how far a search or a sum goes on."""
 
@@ -48,7 +48,7 @@ SPIKE = 0.5
 unnamed, two deviations from none, not its usual size.
 """
 
-OWN_FLOOR = 0.1
+MODEL_ERROR_FLOOR = 0.1
 """Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor.
 
 With it 95 % intervals held 94 % of 85 sizes that were hidden in plants of other code than the
@@ -304,7 +304,7 @@ class Posterior:
         variance = np.diag(self.covariance(columns))[columns]
         return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(variance), SPIKE))
 
-    def surely_there(self, active: Sequence[int]) -> list[int]:
+    def certainly_nonzero(self, active: Sequence[int]) -> list[int]:
         """Return the named effects that are surely not 0 beside one another; the least certain is
         left out first.
         """

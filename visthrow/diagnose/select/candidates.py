@@ -433,7 +433,7 @@ def _unit_shares(
     return columns, root, part, np.eye(len(pairs)) + part[..., columns] * root[:, None]
 
 
-def own_shares(
+def estimate_shares(
     statistics: Statistics, theta: ndarray, shares: Shares, days: Sequence[int]
 ) -> ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in

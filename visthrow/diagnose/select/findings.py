@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, POSSIBLE, Sets
+from visthrow.diagnose.likelihood.evidence import MODEL_ERROR_FLOOR, NORMAL_95, POSSIBLE, Sets
 from visthrow.diagnose.models.model_interface import Effect
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.candidates import allowed, unit_suffix
@@ -67,7 +67,7 @@ class Reading:
         homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
         mean, sd = point.posterior.averaged(j, homes)
-        deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
+        deviation = float(np.hypot(sd, MODEL_ERROR_FLOOR)) * effect.floor
         nats = point.evidence([*remaining, j]) - point.evidence(remaining)
         finding = replace(blank(effect), sd=deviation, nats=nats)
         if j in self.active or partners:

@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood.correlation import Correlation, correlations, 
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     LOST_SHARE,
-    OWN_FLOOR,
+    MODEL_ERROR_FLOOR,
     UNKNOWN_RATIO,
     Posterior,
     Priors,
@@ -31,14 +31,14 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
-from visthrow.diagnose.select.candidates import Shares, freed, own_shares
+from visthrow.diagnose.select.candidates import Shares, estimate_shares, freed
 
 ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,
 and rounds of lost windows: each round has some tenth of what the one before had to do.
 """
 
-SMALL_STEP = 0.5 * OWN_FLOOR
+SMALL_STEP = 0.5 * MODEL_ERROR_FLOOR
 """In floors: a step that is not worth a simulation, and the distance at which an estimate lies on
 its bound.
 """
@@ -386,7 +386,9 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
     """Return the inner products of a point's windows at ``theta``, and with each flight's random
     shares beside it.
     """
-    shares = own_shares(point.plain, theta, point.shares, point.problem.days) + theta - point.theta
+    shares = (
+        estimate_shares(point.plain, theta, point.shares, point.problem.days) + theta - point.theta
+    )
     if not shares.any():
         return list(point.grams)
     row = np.searchsorted(point.plain.flights, [gram.flight for gram in point.grams])

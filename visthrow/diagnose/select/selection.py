@@ -27,8 +27,8 @@ from visthrow.diagnose.select.candidates import (
     NOTHING,
     Names,
     columns_of,
+    estimate_shares,
     laws_of,
-    own_shares,
     random_shares,
     shared,
     without_means,
@@ -303,7 +303,7 @@ class Selector:
         reduced = []
         for trial in tried:
             if trial.lead > ENOUGH_NATS and not self.is_admissible(trial):
-                sure = {*trial.point.posterior.surely_there(trial.columns)}
+                sure = {*trial.point.posterior.certainly_nonzero(trial.columns)}
                 members = (c for c in trial.chosen if c.group != ALL or sure.issuperset(c.columns))
                 reduced.append(frozenset(members))
         return [s for s in reduced if s not in self._simulated]
@@ -343,7 +343,7 @@ class Selector:
         sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
-        shares = own_shares(point.plain, point.theta, point.shares, self.problem.days)
+        shares = estimate_shares(point.plain, point.theta, point.shares, self.problem.days)
         sizes = point.theta + shares
         outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
         if np.any(outside & (sizes != 0.0)):

@@ -13,7 +13,7 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import (
     ALARM,
     INEXACT,
-    OWN_FLOOR,
+    MODEL_ERROR_FLOOR,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
 from visthrow.diagnose.models.model_interface import Model, Window
@@ -31,10 +31,10 @@ from visthrow.diagnose.select.candidates import (
     between_flights,
     by_day,
     columns_of,
+    estimate_shares,
     freed,
     judged,
     laws_of,
-    own_shares,
     relinearised_per_flight,
     unit_suffix,
 )
@@ -151,7 +151,7 @@ def _covariance(
     ``mean_part``: share of the variance between flights that the mean keeps, shape (K,)."""
     columns = list(active)
     sigma = point.posterior.covariance(columns)
-    spread = sigma[np.ix_(columns, columns)] + OWN_FLOOR**2 * np.eye(len(columns))
+    spread = sigma[np.ix_(columns, columns)] + MODEL_ERROR_FLOOR**2 * np.eye(len(columns))
     scale = np.array([f.sd for f in named]) / np.sqrt(np.diag(spread))
     differs = np.array([f.differs for f in named])
     variance = spread * np.outer(scale, scale) + np.diag(mean_part[columns] * differs**2)
@@ -323,7 +323,7 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
         if {selection.block_of(j), residual_block} & blocks:
             in_block.add(j)
     columns = [j for j in best.columns if j not in in_block]
-    return set(names) - set(best.point.posterior.surely_there(columns))
+    return set(names) - set(best.point.posterior.certainly_nonzero(columns))
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
@@ -337,7 +337,7 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
     """Return by how much each effect of one flight alone differs there from all flights' size."""
-    shares = own_shares(point.plain, point.theta, point.shares, point.problem.days)
+    shares = estimate_shares(point.plain, point.theta, point.shares, point.problem.days)
     shares *= point.problem.priors.floor
     row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
     events = [c for c in chosen if c.group == EVENT]

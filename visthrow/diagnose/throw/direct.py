@@ -76,7 +76,7 @@ def direct_samples(
             by_window[last[n]].append(_landing(flight.landing, flight.landing_point))
     for w, c in counting if setting.camera is not None else ():
         flight = flights[c.flight]
-        if flight.payload is not None and seen_by_camera(logs[c.flight]):
+        if flight.payload is not None and has_camera_keypoints(logs[c.flight]):
             by_window[w] += _camera_view(logs[c.flight], flight, c, setting)
     return by_window
 
@@ -86,7 +86,7 @@ def needs_no_flight(e: SettingEffect) -> bool:
     return bool(e.changes) and all(key.path.startswith(ACTS_ON) for key in e.changes)
 
 
-def seen_by_camera(log: FlightLog) -> bool:
+def has_camera_keypoints(log: FlightLog) -> bool:
     """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from
     poses say nothing about it.
     """
@@ -117,7 +117,7 @@ def with_direct(
         count = len(plain)
         columns = np.zeros((count, len(steps)))
         for k in np.flatnonzero(steps):
-            if not _seen_alike(nominal, perturbed[k]):
+            if not _predict_alike(nominal, perturbed[k]):
                 columns[:, k] = (direct.predicted(perturbed[k]) - plain) / steps[k]
         channel = channels.index(direct.channel)
         padding = (0, count), (0, 0)
@@ -134,7 +134,7 @@ def with_direct(
     return window
 
 
-def _seen_alike(a: Setting, b: Setting) -> bool:
+def _predict_alike(a: Setting, b: Setting) -> bool:
     """Whether direct measurements are the same in two settings; the poses are measured ones."""
     height = a.plant.release.landing_height
     other_height = b.plant.release.landing_height
@@ -174,14 +174,14 @@ def _camera_view(
             row = lens.fisheye.cy + points[..., 1] * _reach(lens)[1]
             middle = row.mean(axis=1)
             exposed = time - x.camera_delay + x.camera_line_time * middle
-            seen = _visible_keypoints(view, setting, nominal, exposed)
+            keypoints = _visible_keypoints(view, setting, nominal, exposed)
             if x.camera_line_time != 0.0:
                 later = _visible_keypoints(view, setting, nominal, exposed + SHORT)
                 after = x.camera_line_time * (row - middle[:, None])
-                seen = seen + (later - seen) / SHORT * after[..., None]
+                keypoints = keypoints + (later - keypoints) / SHORT * after[..., None]
         except ValueError:
             return np.full(np.count_nonzero(valid), np.nan)
-        return seen[valid].ravel()
+        return keypoints[valid].ravel()
 
     stamps = np.broadcast_to(time[:, None, None], points.shape)[valid]
     sigma = max(_noise(points, valid), LEAST_KEYPOINT_SIGMA)

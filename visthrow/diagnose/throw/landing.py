@@ -35,7 +35,7 @@ TICK = 5e-3  # between the points of a simulated path [s]; a chord is 0.03 mm of
 
 @dataclass(frozen=True)
 class PredictedLandings:
-    """Throws of which the landing was seen; points [m] on the plane of the landing, in the measured
+    """Throws whose landing was measured; points [m] on the plane of the landing, in the measured
     frame.
     """
 
@@ -61,7 +61,7 @@ class PredictedLandings:
         return np.linalg.norm((points - self.measured)[:, :2], axis=1)
 
 
-def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, ndarray] | None:
+def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndarray] | None:
     """Time [s] and point [m] at which a payload came down; None where nobody saw it.
 
     Without a logged landing the track just above the ground is carried on to ``height`` by a
@@ -101,7 +101,7 @@ def landings(
     numbers = range(len(model.flights.flights)) if flights is None else flights
     before, separating, ends, points = {}, {}, {}, {}
     for n in numbers:
-        landing = seen_landing(model.flights.flights[n], plane)
+        landing = estimate_landing(model.flights.flights[n], plane)
         spans = None if landing is None else _spans(model, n)
         if spans is None:
             continue
@@ -153,7 +153,7 @@ def _fly(
     looked = [_extend_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = model.cut_into(looked, flown)
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
-    measured = onward.fly(model.simulation(setting), states, lanes).seen
+    measured = onward.fly(model.simulation(setting), states, lanes).samples
     points = []
     for i, c in enumerate(flown):
         first = 2 * int(onward.windows["vehicle_count"][i])

@@ -137,8 +137,8 @@ class Linearisation:
         flown = self._flights.fly(self._simulation, self._states, lanes)
 
         def window(plan: Plan, channel: ndarray) -> Window:
-            residual = self._flights.residual(flown.seen, plan.window, plan.first)
-            slopes = self._slopes(flown.seen, plan)
+            residual = self._flights.residual(flown.samples, plan.window, plan.first)
+            slopes = self._slopes(flown.samples, plan)
             return self._window(plan, channel, residual, slopes, flown.knots)
 
         return parallel_map(window, plans, channels)

@@ -267,8 +267,8 @@ class ReplayedFlights:
         recording: Recording | None = None,
     ) -> list[ndarray]:
         """Fly lanes; returns each one's residual, see :meth:`residual` and :meth:`fly`."""
-        seen = self.fly(simulation, states, lanes, recording).seen
-        return [self.residual(seen, lane.window, i) for i, lane in enumerate(lanes)]
+        samples = self.fly(simulation, states, lanes, recording).samples
+        return [self.residual(samples, lane.window, i) for i, lane in enumerate(lanes)]
 
     def differences(
         self,
@@ -281,13 +281,13 @@ class ReplayedFlights:
         see, less what its first lane sees, shape (N, lanes - 1) each; see :meth:`fly`.
         """
         lanes = [lane for group in groups for lane in group]
-        seen = self.fly(simulation, states, lanes, recording).seen
+        samples = self.fly(simulation, states, lanes, recording).samples
         first = 0
         differences = []
         for group in groups:
             rows = int(self.rows[group[0].window])
             last = first + len(group)
-            columns = np.swapaxes(seen[:rows, first:last], 1, 2).reshape(3 * rows, -1)
+            columns = np.swapaxes(samples[:rows, first:last], 1, 2).reshape(3 * rows, -1)
             differences.append(columns[:, 1:] - columns[:, :1])
             first = last
         return differences

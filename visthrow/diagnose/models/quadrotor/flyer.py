@@ -63,7 +63,7 @@ class FlyerModel(DrivenModel):
 
     def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; samples in the order of the replay's sensors."""
-        return self._fly(lanes).seen.swapaxes(0, 1)
+        return self._fly(lanes).samples.swapaxes(0, 1)
 
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
