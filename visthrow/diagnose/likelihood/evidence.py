@@ -11,9 +11,10 @@ with information I and scores s about theta = 0.
 
 Eight constants take part in what is named and what is said of it; all stand here. Whatever else a
 decision is compared with follows from them, from the catalogue's floors and from the 5 mm of
-landing behind these. 34 worlds were judged alike with ``MODEL_ERROR_FLOOR`` at half and double, ``INEXACT``
-at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and 4, ``LOST_SHARE`` at 0.1 and 0.25, one at a time
-(``bench.diagnose.constants``). Other modules' constants say how far a search or a sum goes on."""
+landing behind these. 34 worlds were judged alike with ``MODEL_ERROR_FLOOR`` at half and double,
+``INEXACT`` at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and 4, ``LOST_SHARE`` at 0.1 and 0.25, one at
+a time (``bench.diagnose.constants``). Other modules' constants say how far a search or a sum goes
+on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
