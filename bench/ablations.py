@@ -88,7 +88,7 @@ class Ablations:
         if strange:
             raise DiagnoseError(f"no ablation {', '.join(strange)}; there are {', '.join(LACKS)}")
         logs = self._flown(say)
-        told = [
+        results = [
             self._one(name, logs, lambda line, name=name: say(f"{name}: {line}"))
             for name in self.names
         ]
@@ -96,7 +96,7 @@ class Ablations:
             "policy": self.policy,
             "flights": self.flights,
             "held": self.held,
-            "ablations": told,
+            "ablations": results,
         }
         write_json(self.folder / "record.json", record)
         return record
@@ -120,17 +120,19 @@ class Ablations:
         for i, (path, log) in enumerate(
             zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))
         ):
-            seen = recorded(log, np.random.default_rng(i))
+            recording = recorded(log, np.random.default_rng(i))
             landing = {"landing": log["landing"]} if i >= self.flights else {}
-            FlightLog({**seen.channels, **landing}, seen.meta).save(path)
+            FlightLog({**recording.channels, **landing}, recording.meta).save(path)
         say(f"flown: {count}")
         return paths
 
     def _one(self, name: str, logs: Sequence[Path], say: Callable[[str], None]) -> dict[str, Any]:
         base = f"state_{name}"
-        own = self.folder / name
-        own.mkdir(parents=True, exist_ok=True)
-        verdict = explained(logs[: self.flights], base, own / "verdict.json", self.device, say)
+        subfolder = self.folder / name
+        subfolder.mkdir(parents=True, exist_ok=True)
+        verdict = explained(
+            logs[: self.flights], base, subfolder / "verdict.json", self.device, say
+        )
         theta = named(verdict)
         findings = verdict.get("findings", ())
         record = {
@@ -145,7 +147,7 @@ class Ablations:
             "threshold": verdict.get("threshold"),
         }
         record["nats"] = {f["name"]: f["nats"] for f in findings if f["name"] in theta}
-        kept = own / "held.json"
+        kept = subfolder / "held.json"
         if not kept.exists():
             write_json(
                 kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device)

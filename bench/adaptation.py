@@ -60,13 +60,13 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
     kept = folder / "errors.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    own = load_experiment("state", [ADAPTATION, *args.changes])
+    nominal = load_experiment("state", [ADAPTATION, *args.changes])
     shipped = Policy.load(find_policy("state"))
-    altered = extended(own, hidden)
+    altered = extended(nominal, hidden)
     policy, figures = adapted(altered, shipped, args)
     found = {"hidden": dict(hidden), **figures}
     for stage, experiment, thrower in zip(
-        STAGES, (own, altered, altered), (shipped, shipped, policy), strict=True
+        STAGES, (nominal, altered, altered), (shipped, shipped, policy), strict=True
     ):
         throws = throw(
             experiment, thrower.to(args.device).actor(THROWS), TARGET, THROWS, args.device, SEED
@@ -84,22 +84,22 @@ def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
         errors = {stage: 1e3 * np.array(f[stage]) for stage in STAGES}
         mean = {stage: float(e.mean()) for stage, e in errors.items()}
         won = (mean["before"] - mean["after"]) / (mean["before"] - mean["home"])
-        told = [statistics.mean(errors[stage]).text(1) for stage in STAGES]
+        cells = [statistics.mean(errors[stage]).text(1) for stage in STAGES]
         rows.append(
             (
                 loop.hidden_text(f),
-                *told,
+                *cells,
                 f"{100 * won:.0f} %",
                 str(f["iterations"]),
                 f"{f['seconds']:.1f} s",
             )
         )
-        told_of = {
+        outcome = {
             "error_mm": mean,
             "landed": {stage: len(e) for stage, e in errors.items()},
             "won_back": won,
         }
-        figures.append({k: v for k, v in f.items() if k not in STAGES} | told_of)
+        figures.append({k: v for k, v in f.items() if k not in STAGES} | outcome)
     header = (
         "altered",
         "own vehicle [mm]",

@@ -206,9 +206,14 @@ def measure(params: Any, count: int, device: str, repeats: int, stretch: float =
     header = ("what", "time", "points/s", "time over our keypoints")
     tables = []
     for place, row in times.items():
-        own = row.get("keypoints, CUDA graph", row["keypoints"])
+        baseline = row.get("keypoints, CUDA graph", row["keypoints"])
         cells = tuple(
-            (_LABELS[n], f"{t * 1e3:.3f} ms", f"{rate(count * KEYPOINTS / t)}", f"{t / own:.2f}")
+            (
+                _LABELS[n],
+                f"{t * 1e3:.3f} ms",
+                f"{rate(count * KEYPOINTS / t)}",
+                f"{t / baseline:.2f}",
+            )
             for n, t in row.items()
         )
         where = "one CPU core" if place == "cpu" else device_name(place)

@@ -7,6 +7,6 @@ from visthrow.common.arguments import add_option
 
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
     """Add ``--set``, ``--device`` and ``--json``."""
-    for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
-        if wanted:
+    for name, included in (("--set", True), ("--device", device), ("--json", json)):
+        if included:
             add_option(parser, name, shared=True)

@@ -51,9 +51,9 @@ def main() -> None:
     for seed in range(args.first, args.first + args.throws):
         off, summary, fake = fly(seed, args.yaw)
         found += [] if off is None else [off]
-        told = "not landed" if off is None else f"{off:.3f} m"
+        outcome = "not landed" if off is None else f"{off:.3f} m"
         breaches = f"; {fake.witness.breaches}" if fake.witness.breaches else ""
-        print(f"seed {seed}: {told}; {summary['reason']}{breaches}", flush=True)
+        print(f"seed {seed}: {outcome}; {summary['reason']}{breaches}", flush=True)
     print(f"{len(found)} of {args.throws} landed", end="")
     if found:
         print(f"; {np.mean(found):.4f} m in the mean, {max(found):.3f} m at most", end="")

@@ -156,12 +156,12 @@ def figures_of(
     """
     figures: dict[str, float] = {}
     hits = np.array([visible and reported and off < HIT for _, visible, reported, off, _ in rows])
-    _, was_there, reports, errors, probabilities = map(np.array, zip(*rows))
+    _, presence, reports, errors, probabilities = map(np.array, zip(*rows))
     for kind in ("ball", "goal"):
         of_kind = np.array([row[0] == kind for row in rows])
         off = errors[of_kind & hits] if np.any(of_kind & hits) else np.array([math.nan])
         visible, reported, hit = (
-            int(np.sum(of_kind & selected)) for selected in (was_there, reports, hits)
+            int(np.sum(of_kind & selected)) for selected in (presence, reports, hits)
         )
         figures |= {
             f"{kind}_there": visible,

@@ -112,10 +112,10 @@ class Direct:
                 if start is None and now >= self._start - SLACK:
                     start = now
                     self.pilot.start()
-                command, asked = self._decide(now, start is not None, latch)
+                command, release = self._decide(now, start is not None, latch)
                 if command is not None:
                     self._set_points.add(now + self._late, command)
-                if asked and latch is None:
+                if release and latch is None:
                     latch = now
             self._fly(now, level, latch)
             if self.plant.landing["landing_time"] is not None:

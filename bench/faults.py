@@ -19,7 +19,7 @@ from typing import Any
 import torch
 
 from bench.figures import json_lines
-from bench.processes import CONFIGS, ENDED, Pair, own_cores, side_by_side
+from bench.processes import CONFIGS, ENDED, Pair, assign_cores, side_by_side
 from bench.report import Report, Table
 from bench.soak import STILL, never_releasing
 from tests.mocap_faults import FAULTS
@@ -29,7 +29,7 @@ from visthrow.onboard.hover import GRAVITY
 
 MOCAP = "Motion capture"
 AUTOPILOT = "The autopilot"
-OWN = "The runner itself"
+RUNNER = "The runner itself"
 
 START = 2.5
 """When a fault begins [s]."""
@@ -40,7 +40,7 @@ STARTS = 6.0
 ENOUGH = 6.0
 """Time of a run that ends in its throw [s]: the fake's start, and what there is before a throw."""
 
-LENGTHS = {MOCAP: 1.2, AUTOPILOT: 4.0, OWN: 2.5}
+LENGTHS = {MOCAP: 1.2, AUTOPILOT: 4.0, RUNNER: 2.5}
 """How long it is watched [s]: a heartbeat may be missing for three."""
 
 LATENCY = 0.01
@@ -150,7 +150,7 @@ HOVERS = ("states.armed_least=9.0",)
 
 
 def _ending(text: str, number: int, run: tuple[str, ...] = ()) -> Case:
-    return Case(text, OWN, run=run, act=_signal(number), since="act", ends=True)
+    return Case(text, RUNNER, run=run, act=_signal(number), since="act", ends=True)
 
 
 def _twice(folder: Path, pid: int, speed: float) -> None:
@@ -190,20 +190,20 @@ CASES = {
         run=("ardupilot.mechanism_lag=0.15",),
         refused=True,
     ),
-    "no-numbers": Case("the policy puts out no numbers", OWN, "no numbers", since="throw"),
+    "no-numbers": Case("the policy puts out no numbers", RUNNER, "no numbers", since="throw"),
     "limits": Case(
-        "the policy puts out all that it may, thrust and rates", OWN, "limits", since="throw"
+        "the policy puts out all that it may, thrust and rates", RUNNER, "limits", since="throw"
     ),
-    "late": Case("a tick is 0.15 s late", OWN, act=_pause(0.15), since="act"),
-    "very-late": Case("a tick is 0.8 s late", OWN, act=_pause(0.8), since="act"),
-    "disk-full": Case("the disk is full", OWN, act=_fill_disk, since="act"),
+    "late": Case("a tick is 0.15 s late", RUNNER, act=_pause(0.15), since="act"),
+    "very-late": Case("a tick is 0.8 s late", RUNNER, act=_pause(0.8), since="act"),
+    "disk-full": Case("the disk is full", RUNNER, act=_fill_disk, since="act"),
     **{name: _ending(text, number) for name, (text, number) in ENDS.items()},
     **{
         f"{name}-in-hover": _ending(f"{text}, in hover", number, HOVERS)
         for name, (text, number) in ENDS.items()
     },
-    "ctrl-c-twice": Case("Ctrl-C twice", OWN, act=_twice, since="act", ends=True),
-    "time-over": Case("the time of --seconds is over", OWN, since="time", ends=True),
+    "ctrl-c-twice": Case("Ctrl-C twice", RUNNER, act=_twice, since="act", ends=True),
+    "time-over": Case("the time of --seconds is over", RUNNER, since="time", ends=True),
 }
 
 
@@ -305,12 +305,17 @@ def faults(args: argparse.Namespace) -> Report:
                 f"--kind {args.kind} with {', '.join(odd)}; expected {', '.join(sorted(flown))}"
             )
         names = [name for name in cases if name in (args.faults or flown)]
-        done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
+        done = dict(_announced(side_by_side(inject, names, assign_cores(args.jobs))))
         for name in names:
             case = cases[name]
             found = done[name]
             figures[name] = found
-            row = (name, case.text, _told(found["states"]), _told(found["events"]) or "-")
+            row = (
+                name,
+                case.text,
+                _describe_steps(found["states"]),
+                _describe_steps(found["events"]) or "-",
+            )
             counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (
                 str(len(found["breaches"])),
             )
@@ -348,11 +353,11 @@ def faults(args: argparse.Namespace) -> Report:
 
 def _announced(found: Iterator[tuple[str, dict[str, Any]]]) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, values in found:
-        print(f"{name}: {_told(values['states'])}", file=sys.stderr, flush=True)
+        print(f"{name}: {_describe_steps(values['states'])}", file=sys.stderr, flush=True)
         yield name, values
 
 
-def _told(steps: list[dict[str, Any]]) -> str:
+def _describe_steps(steps: list[dict[str, Any]]) -> str:
     return "; ".join(f"{s['what']} after {s['after']:.2f} s" for s in steps) or "-"
 
 
@@ -381,7 +386,7 @@ def _one(
     except VisthrowError as error:
         if not case.refused:
             raise
-        said = (
+        reason = (
             str(error)
             .strip()
             .splitlines()[0]
@@ -389,7 +394,7 @@ def _one(
         )
         return {
             "began_in": None,
-            "states": [{"what": f"refused: {said}", "after": 0.0}],
+            "states": [{"what": f"refused: {reason}", "after": 0.0}],
             "events": [],
             "missed": 0,
             "commands": 0,

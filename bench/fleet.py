@@ -31,7 +31,7 @@ TARGETS = (1.5, 2.0, 2.5)
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 RIVAL = "state_fast"
 DRAWN = "drawn"
-OWN = "its own"
+SPECIALIST = "its own"
 """What tables call all drawn vehicles, and a policy that was trained for one vehicle."""
 THROWS = 1200
 """Throws at each target on one vehicle."""
@@ -88,9 +88,9 @@ def run(args: argparse.Namespace) -> int:
                 args.seed,
             )
         _write(folder, rows, {})
-    for k, (rival, own) in rivals.items():
+    for k, (rival, experiment) in rivals.items():
         status(f"own policy on {_label(k)}")
-        rows += _thrown(OWN, rival, own, [_label(k)], THROWS, device, args.seed)
+        rows += _thrown(SPECIALIST, rival, experiment, [_label(k)], THROWS, device, args.seed)
     status("")
     seconds = {k: rival.made_by["seconds"] for k, (rival, _) in rivals.items()}
     return finish(_write(folder, rows, seconds), args)
@@ -147,14 +147,14 @@ def _thrown(
     for target in TARGETS:
         thrown = throw(experiment, on.actor(count), target, count, device, seed)
         for k, vehicle in enumerate(vehicles):
-            own = number == k
-            good = own & thrown.success
+            mask = number == k
+            good = mask & thrown.success
             error, duration = (
                 float(x[good].mean()) if good.any() else math.nan
                 for x in (thrown.error, thrown.duration)
             )
             rows.append(
-                Row(name, vehicle, target, int(own.sum()), int(good.sum()), error, duration)
+                Row(name, vehicle, target, int(mask.sum()), int(good.sum()), error, duration)
             )
     return rows
 
@@ -175,20 +175,20 @@ def _rivals(
     )
     base = replace(experiment, ppo=ppo, task=task)
     begin = time.monotonic()
-    wanted = [
+    vehicles = [
         *map(str, range(args.rivals)),
         *(args.named if args.named_rivals else ()),
     ]
     longest = 0.0
-    for vehicle in wanted:
+    for vehicle in vehicles:
         path = folder / f"{vehicle}.npz"
         start = time.monotonic()
         if path.exists() or start - begin + longest > 60.0 * args.minutes:
             continue
-        status(f"training for {_label(vehicle)}, of {len(wanted)}")
+        status(f"training for {_label(vehicle)}, of {len(vehicles)}")
         _trained(_one(base, vehicle), device).save(path)
         longest = max(longest, time.monotonic() - start)
-    found = {vehicle: folder / f"{vehicle}.npz" for vehicle in wanted}
+    found = {vehicle: folder / f"{vehicle}.npz" for vehicle in vehicles}
     return {
         vehicle: (Policy.load(path), _one(base, vehicle))
         for vehicle, path in found.items()
@@ -206,8 +206,8 @@ def _trained(experiment: Any, device: str) -> Any:
     trainer = Trainer(experiment, device, 1)
     while trainer.iteration < trainer.algorithm.iterations:
         trainer.step()
-    told = {**provenance.collect(), "seconds": time.monotonic() - start}
-    return trainer.algorithm.export(contract_of(experiment), told)
+    made_by = {**provenance.collect(), "seconds": time.monotonic() - start}
+    return trainer.algorithm.export(contract_of(experiment), made_by)
 
 
 def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> Report:
@@ -236,9 +236,9 @@ def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
         landed = min(sum(r.landed for r in row) / sum(r.throws for r in row) for row in of)
         return label, policy, str(len(of[0])), *errors, f"{100 * landed:.1f}"
 
-    seen = list(dict.fromkeys(row.vehicle for row in rows))
+    names = list(dict.fromkeys(row.vehicle for row in rows))
     rivals = [_label(k) for k in seconds]
-    groups = {DRAWN: [v for v in seen if v.isdigit()]} | {v: [v] for v in seen if not v.isdigit()}
+    groups = {DRAWN: [v for v in names if v.isdigit()]} | {v: [v] for v in names if not v.isdigit()}
     groups |= {"those with a policy of their own": rivals} if len(rivals) > 1 else {}
     found = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))

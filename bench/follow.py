@@ -74,9 +74,9 @@ def main() -> int:
                 stumbled.append(block.place)
             print(f"-- {block.place}: {time.perf_counter() - start:.1f} s", flush=True)
         wall = time.perf_counter() - begin
-        own = sum(os.times()[2:4]) - spent
+        processor = sum(os.times()[2:4]) - spent
         rows.append(
-            f"{page}: {wall / 60:.1f} min, {own / 60:.1f} of a processor; "
+            f"{page}: {wall / 60:.1f} min, {processor / 60:.1f} of a processor; "
             + (f"STUMBLED at {stumbled}" if stumbled else "well")
         )
     print(*rows, sep="\n")

@@ -75,10 +75,10 @@ def on_reference(
     controller = HoverController(HoverParams(), plant.period, count)
     rows = []
     for k in range(round((HOVER_TIME + HOVER + SWAY) / plant.period)):
-        seen = plant.measured()
+        measured = plant.measured()
         now = plant.exposed
         command = controller.step(
-            seen.pos_w, seen.quat_wb, seen.vel_w, home, plant_of(flown).total_mass
+            measured.pos_w, measured.quat_wb, measured.vel_w, home, plant_of(flown).total_mass
         )
         since = k * plant.period - HOVER_TIME - HOVER
         if since >= -1e-9:
@@ -91,7 +91,7 @@ def on_reference(
             (count, 8, 2)
         )
         if since >= -HOVER - 1e-9:
-            poses = seen.pos_w, seen.quat_wb, seen.vel_w, seen.rate_b
+            poses = measured.pos_w, measured.quat_wb, measured.vel_w, measured.rate_b
             rows.append((np.full(count, plant.time), *poses, command[:, 0], points, valid.numpy()))
         plant.step(command, np.zeros(count, bool))
     hovers = [
@@ -99,7 +99,7 @@ def on_reference(
         for parts in zip(*(np.stack(column, 1) for column in zip(*rows)))
     ]
     extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
-    told = Spreads(
+    spreads = Spreads(
         pos=extras.mocap_position_sigma,
         vel=extras.mocap_velocity_sigma,
         attitude=extras.mocap_angle_sigma,
@@ -109,7 +109,9 @@ def on_reference(
         pose_bias=1e-4,
         keypoint_bias=1e-4,
     )
-    solve = partial(try_calibration, camera=flown.camera, contract=contract_of(flown), spreads=told)
+    solve = partial(
+        try_calibration, camera=flown.camera, contract=contract_of(flown), spreads=spreads
+    )
     with Workers(solve, hovers, cores(), "calibrations") as workers:
         found = dict(workers)
     return [None if isinstance(found[i], str) else found[i] for i in range(count)], turn, scale
@@ -127,12 +129,12 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     flown = hover_start(load_experiment("vision_ideal", DRAWN))
-    asked = TILT_DEG
+    tilt_limit = TILT_DEG
     if args.plant == "hybrid":
         found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
         found, turn, scale = on_reference(flown, args.plant, args.count, args.seed)
-        asked = 0.5 * TILT_DEG
+        tilt_limit = 0.5 * TILT_DEG
     known = [i for i, one in enumerate(found) if one is not None]
     off = np.degrees([np.array(found[i].turn_b) - turn[i] for i in known])
     sigma = np.degrees([found[i].turn_sigma for i in known])
@@ -142,14 +144,14 @@ def main() -> None:
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         rms = np.sqrt(np.mean(off[:, axis] ** 2))
         held = np.mean(np.abs(off[:, axis]) < 2.0 * sigma[:, axis])
-        within = np.sum(np.abs(off[:, axis]) < asked)
+        within = np.sum(np.abs(off[:, axis]) < tilt_limit)
         print(
-            f"{name}: {within} of {len(known)} within {asked} deg, rms {rms:.3f} deg,"
+            f"{name}: {within} of {len(known)} within {tilt_limit} deg, rms {rms:.3f} deg,"
             f" {100 * held:.0f} % within two stated deviations"
         )
     print(
-        f"roll and pitch both: {np.sum((np.abs(off[:, :2]) < asked).all(1))} of {len(known)} within"
-        f" {asked} deg"
+        f"roll and pitch both: {np.sum((np.abs(off[:, :2]) < tilt_limit).all(1))} of {len(known)}"
+        f" within {tilt_limit} deg"
     )
     for name, unit, error, limit, scaling in (
         ("latency", "ms", late, LATENCY, 1e3),

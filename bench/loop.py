@@ -125,12 +125,12 @@ class Loop:
         begin = time.perf_counter()
         seconds = {}
 
-        def told(line: str) -> None:
+        def report(line: str) -> None:
             say(f"{time.perf_counter() - begin:4.0f} s: {line}")
 
         def timed(name: str, stage: Callable[..., Any], *args: Any) -> Any:
             start = time.perf_counter()
-            result = stage(*args, told)
+            result = stage(*args, report)
             seconds[name] = round(time.perf_counter() - start, 1)
             return result
 
@@ -146,7 +146,7 @@ class Loop:
             blind = stages.submit(timed, "throws before", self._throws, "before", self.policy)
             verdict = timed("diagnosis", self._diagnose, logs)
             theta = named(verdict)
-            told(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
+            report(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
             throws = dict.fromkeys(WHO)
             if theta:
                 self._config("extended", extended(nominal, theta))
@@ -363,11 +363,12 @@ def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
         for name in ("command", "release_command", "battery_voltage", "pos_w", "quat_wb")
     }
     channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
-    seen = mocap.measured(
+    measured = mocap.measured(
         {name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng
     )
     channels |= {
-        name: dataclasses.replace(channels[name], values=values) for name, values in seen.items()
+        name: dataclasses.replace(channels[name], values=values)
+        for name, values in measured.items()
     }
     return FlightLog(channels, {"policy": log.meta["policy"], "plant": log.meta["plant"]})
 
@@ -394,11 +395,11 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
     for r in records:
         found = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
         errors = {name: landed(throws) for name, throws in r["throws"].items()}
-        told = []
+        cells = []
         for name in WHO:
             count = f" ({len(errors[name])} of {len(r['throws'][name]['error'])} landed)"
             whole = len(errors[name]) == len(r["throws"][name]["error"])
-            told.append(
+            cells.append(
                 (statistics.mean(1e3 * errors[name]).text(0) if len(errors[name]) else "-")
                 + ("" if whole else count)
             )
@@ -412,7 +413,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
                 f"{100 * share['share']:.0f} % [{100 * share['low']:.0f},"
                 f" {100 * share['high']:.0f}]"
             )
-        lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(told)} | {won} |")
+        lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(cells)} | {won} |")
     return "\n".join(lines)
 
 

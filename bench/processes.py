@@ -49,7 +49,7 @@ def free_port(kind: int = socket.SOCK_DGRAM) -> int:
                 return port
 
 
-def own_cores(jobs: int) -> list[tuple[int | None, int | None]]:
+def assign_cores(jobs: int) -> list[tuple[int | None, int | None]]:
     """Cores of run and fake for each of so many pairs at once; None where there are too few for two
     each and one to spare.
     """
@@ -162,11 +162,11 @@ class Pair:
                 other = both.enter_context(self._started(fake, self.fake_core))
                 _first_line(other, "the fake")
             runner = both.enter_context(self._started(run, self.core))
-            said = _first_line(runner, "ready after")
+            ready_line = _first_line(runner, "ready after")
             if self.kind != "betaflight":
                 other = both.enter_context(self._started(fake, self.fake_core))
             interrupted = self._until(other, watch, runner, alone)
-            killed = _end(runner, said, alone)
+            killed = _end(runner, ready_line, alone)
         try:
             summary = (
                 {} if killed else json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -247,7 +247,7 @@ def _until(
         raise VisthrowError(f"the fake failed: {fake.stderr.read()}")
 
 
-def _end(runner: subprocess.Popen, said: str, alone: bool) -> bool:
+def _end(runner: subprocess.Popen, ready_line: str, alone: bool) -> bool:
     """The fake is gone; what is still flying is told to stop.
 
     Whether the run had been killed, which it may where it was left alone.
@@ -258,7 +258,7 @@ def _end(runner: subprocess.Popen, said: str, alone: bool) -> bool:
         _, text = runner.communicate(timeout=ENDED)
     except subprocess.TimeoutExpired as error:
         raise VisthrowError(
-            f"the run did not end within {ENDED:g} s after it was told to: {said}"
+            f"the run did not end within {ENDED:g} s after it was told to: {ready_line}"
         ) from error
     if alone and runner.returncode == -signal.SIGKILL:
         return True

@@ -102,11 +102,11 @@ def changed(
     """Other values of some channels in all logs."""
 
     def one(log: FlightLog) -> FlightLog:
-        there = {n: c for n, c in log.channels.items() if n in names}
+        chosen = {n: c for n, c in log.channels.items() if n in names}
         return FlightLog(
             {
                 **log.channels,
-                **{n: replace(c, values=change(c.values.astype(float))) for n, c in there.items()},
+                **{n: replace(c, values=change(c.values.astype(float))) for n, c in chosen.items()},
             },
             log.meta,
         )
@@ -478,9 +478,9 @@ def run(task: tuple[Case, Path]) -> dict:
         logs = case.change(_read(case.files, data, name))
         try:
             diagnosis = diagnose(logs, model_of(logs), vehicle=known)
-            said = report.summary(diagnosis)
+            text = report.summary(diagnosis)
         except Exception as error:  # what a user would be told
-            said = f"error: {error}\n" + "\n".join(
+            text = f"error: {error}\n" + "\n".join(
                 f"{r.topic} {r.channel}: {r.text}"
                 for c in check(logs, known)
                 for r in c.rows
@@ -488,9 +488,9 @@ def run(task: tuple[Case, Path]) -> dict:
             )
             return {
                 "case": case.name,
-                "said": said,
+                "said": text,
                 "overall": "error",
-                "ok": bool(case.expect and re.search(case.expect, said)),
+                "ok": bool(case.expect and re.search(case.expect, text)),
             }
         held = diagnosis.held_out.channels if diagnosis.held_out else ()
         row = {
@@ -498,7 +498,7 @@ def run(task: tuple[Case, Path]) -> dict:
             "of": case.of,
             "overall": diagnosis.overall,
             "named": list(diagnosis.theta),
-            "said": said.split("\n\n")[0],
+            "said": text.split("\n\n")[0],
             "varies": [s.name for s in diagnosis.scatter if s.found],
             "gain": {c.channel: [c.before, c.after, c.floor, c.gain, c.low, c.high] for c in held},
             "sizes": {
@@ -509,7 +509,7 @@ def run(task: tuple[Case, Path]) -> dict:
             "partners": {name: diagnosis[name].partners for name in diagnosis.theta},
         }
         if case.expect:
-            row["ok"] = bool(re.search(case.expect, said))
+            row["ok"] = bool(re.search(case.expect, text))
         if case.test and diagnosis.theta:
             unseen = case.of_test(_read(case.test, data, name))
             row["unseen"] = _unseen(diagnosis, model_of(unseen), model_of(unseen))

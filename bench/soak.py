@@ -39,7 +39,7 @@ class Progress(Memory):
         super().__init__()
         self._path = path
         self._minutes = minutes
-        self._told = -TELL
+        self._written_at = -TELL
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
 
@@ -51,8 +51,8 @@ class Progress(Memory):
     def __call__(self, pid: int) -> None:
         """See `Memory`."""
         super().__call__(pid)
-        if self.samples and self.seconds >= self._told + TELL:
-            self._told = self.seconds
+        if self.samples and self.seconds >= self._written_at + TELL:
+            self._written_at = self.seconds
             with self._path.open("a", encoding="utf-8") as file:
                 file.write(
                     json.dumps({"seconds": self.seconds, "memory_bytes": self.samples[-1][1]})

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bench.figures import bootstrap_upper, finite, json_lines
-from bench.processes import Pair, own_cores, side_by_side
+from bench.processes import Pair, assign_cores, side_by_side
 from bench.report import Report, Table
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
@@ -66,7 +66,7 @@ def series(args: argparse.Namespace) -> Report:
             )
 
         for count, line in enumerate(
-            side_by_side(fly, left, own_cores(args.jobs)), start=1 + args.throws - len(left)
+            side_by_side(fly, left, assign_cores(args.jobs)), start=1 + args.throws - len(left)
         ):
             _keep(kept, line, file)
             _progress(count, args.throws, line, kept[("direct", line["seed"])])
@@ -79,11 +79,11 @@ def _keep(kept: dict, line: dict[str, Any], file: Any) -> None:
 
 
 def _progress(count: int, most: int, wire: dict[str, Any], direct: dict[str, Any]) -> None:
-    told = [
+    errors = [
         f"{line['error']:.3f} m" if finite(line["error"]) else "none" for line in (wire, direct)
     ]
     print(
-        f"throw {count} of {most}: over the wire {told[0]}, without it {told[1]}",
+        f"throw {count} of {most}: over the wire {errors[0]}, without it {errors[1]}",
         file=sys.stderr,
         flush=True,
     )
@@ -130,14 +130,14 @@ def _over_the_wire(
     )
     summary, report = Pair(run, fake, *cores).fly(folder)
     landed = report["landing_w"]
-    seen = (summary["landings"] or [{}])[0]
+    landing = (summary["landings"] or [{}])[0]
     line = {
         "way": "wire",
         "seed": seed,
         "error": None,
         "duration": None,
         "landing_w": landed,
-        "seen": seen.get("error"),
+        "seen": landing.get("error"),
         "reason": summary["reason"],
         "missed": summary["missed"],
         "missed_ours": summary["missed_ours"],
@@ -150,9 +150,9 @@ def _over_the_wire(
         "separation_lag": _apart(report),
     }
     if landed is not None:
-        goal_w = seen.get("goal_w", (2.0, 0.0, 0.0))
+        goal_w = landing.get("goal_w", (2.0, 0.0, 0.0))
         line["error"] = float(np.hypot(landed[0] - goal_w[0], landed[1] - goal_w[1]))
-        line["duration"] = seen.get("duration")
+        line["duration"] = landing.get("duration")
     if not args.keep_runs:
         shutil.rmtree(folder)
     return line

@@ -34,7 +34,7 @@ THROWS = 200
 SEEDS = 8
 RIVAL = "rival"
 LOCATED = "vision_located"
-TOLD = "state"
+STATE = "state"
 """The plain rival, the policy whose estimator it has, and the one that it flies."""
 
 FAULTS = {
@@ -108,7 +108,7 @@ def thrown(
     experiment = loaded.experiment
     flown = loaded.policy
     if name == RIVAL:
-        flown = Policy.load(find_policy(TOLD))
+        flown = Policy.load(find_policy(STATE))
     begin: Callable = start_calibrated(experiment) if calibrate else ThrowEnv.reset
     each = []
     for seed in range(SEEDS):

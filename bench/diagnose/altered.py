@@ -89,8 +89,8 @@ def scrambled(logs: Sequence[FlightLog]) -> list[FlightLog]:
     for i, log in enumerate(logs):
         groups.setdefault(len(log["command"].time), []).append(i)
     out = list(logs)
-    for own in groups.values():
-        for i, j in zip(own, own[1:] + own[:1]):
+    for group in groups.values():
+        for i, j in zip(group, group[1:] + group[:1]):
             channels = dict(logs[i].channels) | {
                 name: logs[j][name] for name in ("command", "release_command")
             }

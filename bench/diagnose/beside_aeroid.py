@@ -65,7 +65,7 @@ def slope(state: np.ndarray, size: dict[str, float]) -> np.ndarray:
     return np.append(vel, -size["ball_drag"] * np.sqrt(air @ air) * air - [0.0, 0.0, GRAVITY])
 
 
-def by_aeroid(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, float]]:
+def by_aeroid(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
     """Estimates and standard errors; what each throw began with is estimated beside the
     parameters.
     """
@@ -74,7 +74,7 @@ def by_aeroid(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, fl
     states = [f"{what}{axis}{i}" for i in range(THROWS) for what in ("p", "v") for axis in "xyz"]
     places = [name for name in states if name.startswith("p")]
     starts = []
-    for path in seen:
+    for path in positions:
         line = np.polynomial.polynomial.polyfit(stamps, path, 3)
         starts += [*line[0], *line[1]]
     begin = {f"start_{name}": float(value) for name, value in zip(states, starts)}
@@ -90,25 +90,25 @@ def by_aeroid(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, fl
     model = aeroid.Model(
         states, [], {**guess, **begin}, dynamics, outputs=places, measurement=measured
     )
-    columns = np.moveaxis(seen, 0, 1).reshape(len(stamps), -1)
+    columns = np.moveaxis(positions, 0, 1).reshape(len(stamps), -1)
     data = aeroid.FlightData(stamps, dict(zip(places, columns.T)))
     found = aeroid.identify(model, data, [*NAMES, *begin], x0=np.zeros(len(states)))
     return {name: (found.parameters[name], found.stderr[name]) for name in NAMES}
 
 
-def model_of(stamps: np.ndarray, seen: np.ndarray) -> BallModel:
+def model_of(stamps: np.ndarray, positions: np.ndarray) -> BallModel:
     """The diagnosis' model of the same throws, cut where they fall."""
     rest = stamps[-1] + np.arange(1, REST) / RATE
-    still = [np.concatenate([path, np.tile(path[-1], (len(rest), 1))]) for path in seen]
+    still = [np.concatenate([path, np.tile(path[-1], (len(rest), 1))]) for path in positions]
     time = np.append(stamps, rest)
     return BallModel(
         [FlightLog({"payload_pos_w": Channel(time, path, "m", "world")}) for path in still], ASSUMED
     )
 
 
-def by_fit(stamps: np.ndarray, seen: np.ndarray) -> dict[str, tuple[float, float]]:
+def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
     """The same of the diagnosis' estimator, whose names are given."""
-    found = fitting.fit(model_of(stamps, seen), NAMES)
+    found = fitting.fit(model_of(stamps, positions), NAMES)
     return {
         name: (float(found.theta[i]), float(np.sqrt(found.covariance[i, i])))
         for i, name in enumerate(NAMES)
@@ -121,28 +121,28 @@ def compared(seed: int, colour: str) -> dict:
     """
     truth, stamps, paths = world(seed)
     rng = np.random.default_rng([seed, 1])
-    seen = paths + SIGMA * np.array([sensor_noise(rng, colour, path.shape) for path in paths])
+    positions = paths + SIGMA * np.array([sensor_noise(rng, colour, path.shape) for path in paths])
     line = {"seed": seed, "noise": colour or "white", "truth": truth}
     for who, ask in (("aeroid", by_aeroid), ("fit", by_fit)):
         begin = time.perf_counter()
-        found = ask(stamps, seen)
+        found = ask(stamps, positions)
         line[who] = {
             name: {"error": value - truth[name], "sd": sd} for name, (value, sd) in found.items()
         }
         line[f"{who}_s"] = time.perf_counter() - begin
     begin = time.perf_counter()
-    verdict = diagnose_flights.explain(model_of(stamps, seen), laws=False)
+    verdict = diagnose_flights.explain(model_of(stamps, positions), laws=False)
     line |= {
         "explain_s": time.perf_counter() - begin,
         "overall": verdict.overall,
         "named": sorted(verdict.theta),
     }
-    told = {f.name: f for f in verdict.findings if f.verdict in ("FOUND", "CLASS", "CANDIDATE")}
-    line["verdicts"] = {name: f.verdict for name, f in told.items()}
+    reported = {f.name: f for f in verdict.findings if f.verdict in ("FOUND", "CLASS", "CANDIDATE")}
+    line["verdicts"] = {name: f.verdict for name, f in reported.items()}
     line["explain"] = {
-        name: {"error": told[name].estimate - truth[name], "sd": told[name].sd}
+        name: {"error": reported[name].estimate - truth[name], "sd": reported[name].sd}
         for name in NAMES
-        if name in told
+        if name in reported
     }
     return line
 
@@ -153,26 +153,26 @@ def summary(lines: list[dict]) -> dict:
     """
     out: dict = {}
     for noise in sorted({line["noise"] for line in lines}):
-        own = [line for line in lines if line["noise"] == noise]
+        group = [line for line in lines if line["noise"] == noise]
         for who in ("aeroid", "fit"):
-            found = [line[who][name] for line in own for name in NAMES]
+            found = [line[who][name] for line in group for name in NAMES]
             out[f"{noise}: {who}"] = {
-                "worlds": len(own),
+                "worlds": len(group),
                 "rms": {
-                    name: float(np.sqrt(np.mean([line[who][name]["error"] ** 2 for line in own])))
+                    name: float(np.sqrt(np.mean([line[who][name]["error"] ** 2 for line in group])))
                     for name in NAMES
                 },
                 "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in found)} of {len(found)}",
-                "seconds": float(np.median([line[f"{who}_s"] for line in own])),
+                "seconds": float(np.median([line[f"{who}_s"] for line in group])),
             }
-        sizes = [found for line in own for found in line["explain"].values()]
+        sizes = [found for line in group for found in line["explain"].values()]
         out[f"{noise}: explain"] = {
-            "worlds": len(own),
-            "known": sum(line["overall"] == "KNOWN" for line in own),
-            "wrong names": sum(bool(set(line["named"]) - set(NAMES)) for line in own),
-            "named": {name: sum(name in line["explain"] for line in own) for name in NAMES},
+            "worlds": len(group),
+            "known": sum(line["overall"] == "KNOWN" for line in group),
+            "wrong names": sum(bool(set(line["named"]) - set(NAMES)) for line in group),
+            "named": {name: sum(name in line["explain"] for line in group) for name in NAMES},
             "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in sizes)} of {len(sizes)}",
-            "seconds": float(np.median([line["explain_s"] for line in own])),
+            "seconds": float(np.median([line["explain_s"] for line in group])),
         }
     return out
 

@@ -115,8 +115,8 @@ def explained(
     for i, log in enumerate(logs):
         log.save(place / f"flight_{i:02d}.npz")
     tool(place, *command_for(len(logs), recipe, action, plant), *more)
-    said = json.loads((place / "said.json").read_text())
-    return said | {"tables": {path.name: path.read_text() for path in place.glob("out/*.csv")}}
+    answer = json.loads((place / "said.json").read_text())
+    return answer | {"tables": {path.name: path.read_text() for path in place.glob("out/*.csv")}}
 
 
 def names(verdict: dict) -> set[str]:
@@ -432,10 +432,15 @@ def main() -> None:
             tally.setdefault(line["kind"], Counter()).update(
                 ["cases"] + ["passed"] * bool(line["passed"])
             )
-            said = line.get("said", {})
-            told = said.get("overall"), said.get("theta"), line["seconds"], line.get("error", "")
+            answer = line.get("said", {})
+            outcome = (
+                answer.get("overall"),
+                answer.get("theta"),
+                line["seconds"],
+                line.get("error", ""),
+            )
             world = line["recipe"]["plant"], line["recipe"]["effects"]
-            print("ok  " if line["passed"] else "FAIL", line["kind"], *world, *told, flush=True)
+            print("ok  " if line["passed"] else "FAIL", line["kind"], *world, *outcome, flush=True)
     for kind, count in tally.items():
         print(f"{kind}: {count['passed']} of {count['cases']}")
 

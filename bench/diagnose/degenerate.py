@@ -53,36 +53,36 @@ class Pair:
         ]
         logs = [flight_log(record) for record in follow(recipe, tables, 0)]
         about = ("--about", self.effect) if not self.alike else ()
-        said = first = explained(folder, logs, recipe, action="plan", more=about)
+        answer = first = explained(folder, logs, recipe, action="plan", more=about)
         done = []
         measured = []
         for number in range(1, ROUNDS + 1):
             if number > 1:
-                said = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
-            if not said["session"]:
+                answer = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
+            if not answer["session"]:
                 break
-            for proposal in (p for p in said["proposals"] if p["name"] in said["session"]):
+            for proposal in (p for p in answer["proposals"] if p["name"] in answer["session"]):
                 done.append((proposal["name"], proposal["repeats"]))
                 effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
                 if effect is None:
                     payload = manoeuvre_of(proposal["name"]).payload
-                    logs += self.flown(recipe, said, proposal, payload, len(done))
+                    logs += self.flown(recipe, answer, proposal, payload, len(done))
                     continue
                 error = effect.sd * np.random.default_rng([recipe.seed, len(done)]).normal()
                 value = recipe.effects.get(effect.effect, 0.0) + error
                 if abs(value) > CLEAR * effect.sd:
-                    return self.line(first, said, done, effect.effect == self.effect)
+                    return self.line(first, answer, done, effect.effect == self.effect)
                 measured += ["--measured", f"{effect.effect}={effect.sd}"]
-            said = explained(folder, logs, recipe, more=measured)
-            if self.named(said):
+            answer = explained(folder, logs, recipe, more=measured)
+            if self.named(answer):
                 break
-        return self.line(first, said, done, self.named(said))
+        return self.line(first, answer, done, self.named(answer))
 
     def flown(
-        self, recipe: Recipe, said: dict, proposal: dict, payload: bool, number: int
+        self, recipe: Recipe, answer: dict, proposal: dict, payload: bool, number: int
     ) -> list[FlightLog]:
         """Fly a proposal on the plant as often as it asks, within reason."""
-        table = table_of(said["tables"][proposal["reference"]], payload)
+        table = table_of(answer["tables"][proposal["reference"]], payload)
         times = min(max(proposal["repeats"], 1), MOST_FLIGHTS)
         return [
             flight_log(record)
@@ -91,24 +91,24 @@ class Pair:
             )
         ]
 
-    def named(self, said: dict) -> bool:
+    def named(self, answer: dict) -> bool:
         """Whether it is named, alone."""
-        return named_by(said) == [{self.effect}]
+        return named_by(answer) == [{self.effect}]
 
-    def told(self, said: dict) -> bool:
+    def admits_ambiguity(self, answer: dict) -> bool:
         """Whether the first answer says that these flights cannot tell."""
         if not self.alike:
             return (
-                next(f["verdict"] for f in said["findings"] if f["name"] == self.effect)
+                next(f["verdict"] for f in answer["findings"] if f["name"] == self.effect)
                 == "NOT IDENTIFIABLE"
             )
-        return any(self.effect in group and group & self.alike for group in named_by(said))
+        return any(self.effect in group and group & self.alike for group in named_by(answer))
 
     def line(self, first: dict, last: dict, done: list, named: bool) -> dict:
         """What the ledger keeps."""
         return {
-            "passed": self.told(first) and named,
-            "told": self.told(first),
+            "passed": self.admits_ambiguity(first) and named,
+            "told": self.admits_ambiguity(first),
             "named": named,
             "done": done,
             "before": first,

@@ -139,19 +139,23 @@ def right(recipe: Recipe, verdict: dict) -> bool:
 
     Lost commands are told, and named for nothing else.
     """
-    said = judge(recipe, verdict)
+    judgement = judge(recipe, verdict)
     laws = [name for name in recipe.effects if name in LAWS]
     if laws:
-        return said["unknown"] and not said["named"] and TERMS[laws[0]] in said["laws"]
+        return (
+            judgement["unknown"] and not judgement["named"] and TERMS[laws[0]] in judgement["laws"]
+        )
     if recipe.lost:
         return (
-            said["overall"] == "KNOWN"
-            and not said["named"]
-            and said["varies"] == ["dropped_commands"]
+            judgement["overall"] == "KNOWN"
+            and not judgement["named"]
+            and judgement["varies"] == ["dropped_commands"]
         )
     sized = all(size_is(verdict, name, size) for name, size in recipe.effects.items())
     return (
-        said["class"] and sized and said["overall"] == ("KNOWN" if recipe.effects else "NO EFFECT")
+        judgement["class"]
+        and sized
+        and judgement["overall"] == ("KNOWN" if recipe.effects else "NO EFFECT")
     )
 
 
@@ -159,7 +163,7 @@ _FLOWN: dict[str, list[bytes]] = {}
 """Digest of a recipe -> the files of its flights: tools are asked about the same worlds."""
 
 
-def asked(tool: Tool, recipe: Recipe) -> dict:
+def ask(tool: Tool, recipe: Recipe) -> dict:
     """A tool's verdict on a world, whose truth is sealed before; files bear the name of an effect
     that is not hidden.
     """
@@ -188,14 +192,14 @@ def require(tool: Tool, chosen: list[Kind], seed: int) -> None:
         wrong = []
         for again in range(2):
             recipe = kind.draw(seed + 100 * i + 10 * again)
-            verdict = asked(tool, recipe)
+            verdict = ask(tool, recipe)
             if right(recipe, verdict):
                 break
-            said = judge(recipe, verdict)
+            judgement = judge(recipe, verdict)
             hidden = recipe.effects or recipe.lost or "nothing"
             wrong.append(
-                f"{hidden} on the {recipe.plant}, seed {recipe.seed}: {said['overall']}"
-                f" {said['named']}"
+                f"{hidden} on the {recipe.plant}, seed {recipe.seed}: {judgement['overall']}"
+                f" {judgement['named']}"
             )
         assert len(wrong) < 2, "; ".join(wrong)
 
@@ -256,18 +260,18 @@ def always(name: str) -> Tool:
 
 def once(tool: Tool) -> Tool:
     """The same tool, which remembers what it said of the same files and model."""
-    said: dict[str, str] = {}
+    answers: dict[str, str] = {}
 
-    def asked_once(folder: Path, model: list[str]) -> dict:
+    def ask_once(folder: Path, model: list[str]) -> dict:
         logs = b"".join(
             path.name.encode() + path.read_bytes() for path in sorted(folder.glob("*.npz"))
         )
         key = hashlib.sha256(logs + repr(model).encode()).hexdigest()
-        if key not in said:
-            said[key] = json.dumps(tool(folder, model))
-        return json.loads(said[key])
+        if key not in answers:
+            answers[key] = json.dumps(tool(folder, model))
+        return json.loads(answers[key])
 
-    return asked_once
+    return ask_once
 
 
 def exchanged(one: str, other: str, real: Tool = explain) -> Tool:
@@ -290,14 +294,14 @@ def main() -> None:
     count = int(sys.argv[1])
     first = int.from_bytes(os.urandom(4), "little")
     print(f"first seed {first}")
-    asked_of = Counter()
+    worlds = Counter()
     good = Counter()
     for suite in range(count):
         seed = first + 10_000 * suite
         for i, kind in enumerate(kinds(np.random.default_rng(seed))):
             recipe = kind.draw(seed + 100 * i)
             with contextlib.redirect_stdout(io.StringIO()):
-                verdict = asked(explain, recipe)
+                verdict = ask(explain, recipe)
             what = (
                 "lost commands"
                 if kind.lost
@@ -306,23 +310,23 @@ def main() -> None:
                 else f"{len(kind.hidden)} hidden"
             )
             what = f"{kind.plant}: {what}"
-            asked_of[what] += 1
+            worlds[what] += 1
             good[what] += right(recipe, verdict)
             if not right(recipe, verdict):
-                said = judge(recipe, verdict)
+                judgement = judge(recipe, verdict)
                 print(
                     "  wrong:",
                     recipe.effects,
                     recipe.lost,
                     recipe.seed,
-                    said["overall"],
-                    said["named"],
-                    said["laws"],
+                    judgement["overall"],
+                    judgement["named"],
+                    judgement["laws"],
                     flush=True,
                 )
         print(
             f"{suite + 1} suites:",
-            ", ".join(f"{what} {good[what]} of {n}" for what, n in sorted(asked_of.items())),
+            ", ".join(f"{what} {good[what]} of {n}" for what, n in sorted(worlds.items())),
             flush=True,
         )
 

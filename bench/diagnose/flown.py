@@ -52,7 +52,7 @@ def fly(
     half = np.arange(0.0, seconds + step, 0.5 * step)
     begin = 10.0 * seed  # no two flights turn alike
     rot = attitude(half + begin).as_matrix()
-    told = (
+    demand = (
         load
         * G
         / rot[:, 2, 2]
@@ -81,7 +81,7 @@ def fly(
         apart = p - above[i]
         force = force + downwash * apart[2] / np.sum(apart**2) * np.array([0.0, 0.0, 1.0])
         force = force + [swirl * v[1], beat * np.sin(4.5 * half[i]) - swirl * v[0], 0.0]
-        lag = [(told[i] - thrust) / 0.03]
+        lag = [(demand[i] - thrust) / 0.03]
         if cable is None:
             return np.concatenate([v, force / mass, lag])
         vp = state[10:13]
@@ -95,7 +95,7 @@ def fly(
             [v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload]
         )
 
-    state = np.array([0, 0, 5.0, 0, 0, 0, told[0]])
+    state = np.array([0, 0, 5.0, 0, 0, 0, demand[0]])
     if cable:
         hung = near[1][0] + [0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99)]
         state = np.concatenate([state, hung, arm_rate[0]])
@@ -107,21 +107,21 @@ def fly(
         state = state + step / 6 * (k1 + 2 * k2 + 2 * k3 + slope(i + 2, state + step * k3))
         path.append(state)
     path, time = np.array(path)[::2], half[::4][: len(path[::2])]
-    thrust = told[::4][: len(time)] / 4.0
+    thrust = demand[::4][: len(time)] / 4.0
     command = (-0.06 + np.sqrt(0.06**2 + 0.4 * thrust)) / 0.2
 
-    def seen(columns):
+    def measure(columns):
         return Channel(time, columns + rng.normal(0, noise, (len(time), 3)), "m", "world")
 
     channels = {
-        "pos_w": seen(path[:, :3]),
+        "pos_w": measure(path[:, :3]),
         "quat_wb": Channel(time, attitude(time + begin - late).as_quat(), "1", "world"),
         "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
         "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
     }
     if downwash:
         channels["neighbour_pos_w"] = Channel(time, above[::4][: len(time)], "m", "world")
-    return FlightLog(channels | ({"payload_pos_w": seen(path[:, 7:10])} if cable else {}))
+    return FlightLog(channels | ({"payload_pos_w": measure(path[:, 7:10])} if cable else {}))
 
 
 def ball_log(

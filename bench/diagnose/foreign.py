@@ -157,7 +157,7 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
     beat = rng.uniform(0.9, 2.2, 3)
     turned = rng.uniform(0.0, 2.0 * np.pi, 4)
 
-    def wanted(t: float) -> np.ndarray:
+    def reference(t: float) -> np.ndarray:
         """Place, speed and acceleration, shape (3, 3)."""
         a = beat * t + turned[:3]
         fade = 1.0 - np.exp(-t * t)
@@ -208,7 +208,7 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
             + 200.0 * (gap @ gap - L * L)
         )
         tie = max(along / (gap @ gap) / (1.0 / m + 1.0 / M), 0.0) * gap
-        asked = sent[1][max(np.searchsorted(sent[0], t - world["late"], "right") - 1, 0)]
+        demanded = sent[1][max(np.searchsorted(sent[0], t - world["late"], "right") - 1, 0)]
         spun = 0.5 * np.array([*(q[3] * w + cross(q, w)), -q[:3] @ w])
         turning = (torque - cross(w, J * w)) / J
         changes = (
@@ -218,12 +218,12 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
             (pull - tie) / m,
             spun,
             turning,
-            [(asked - f) / world["lag"]],
+            [(demanded - f) / world["lag"]],
             (v - past) / REMEMBERS,
         )
         return np.concatenate(changes)
 
-    start = wanted(0.0)[0]
+    start = reference(0.0)[0]
     hold = (M + m) * G / world["gain"]
     y = np.concatenate(
         [start, start - [0, 0, L], np.zeros(6), [0, 0, 0, 1.0], np.zeros(3), [hold], np.zeros(3)]
@@ -232,7 +232,7 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
     sent = []
     path = [y]
     for t in times:
-        place, speed, pushed = wanted(t)
+        place, speed, pushed = reference(t)
         force = (M + m) * (4.0 * (place - y[:3]) + 3.5 * (speed - y[6:9]) + pushed + [0.0, 0.0, G])
         turn = Rotation.from_quat(y[12:16]).as_matrix()
         up = force / np.linalg.norm(force)
@@ -275,16 +275,16 @@ def recorded(
     slerp = Slerp(clock, Rotation.from_quat(path[:, 12:16]))
     tilt = Rotation.from_rotvec([0.0, world["tilt"], 0.0])
     turn = slerp(shots)
-    seen = tilt.apply(
+    vehicle = tilt.apply(
         spline(shots - world["stamp"])[:, :3]
         + slerp(shots - world["stamp"]).apply([world["arm"], 0.0, 0.0])
     )
     ball = tilt.apply(spline(shots - world["ball_stamp"])[:, 3:])
-    seen, ball = (np.round(x + rng.laplace(0.0, 2e-4, x.shape), 4) for x in (seen, ball))
+    vehicle, ball = (np.round(x + rng.laplace(0.0, 2e-4, x.shape), 4) for x in (vehicle, ball))
     quat = (tilt * turn * Rotation.from_rotvec(rng.laplace(0.0, 6e-4, (len(shots), 3)))).as_quat()
     return FlightLog(
         {
-            "pos_w": Channel(shots, seen, "m", "world"),
+            "pos_w": Channel(shots, vehicle, "m", "world"),
             "payload_pos_w": Channel(shots, ball, "m", "world"),
             "quat_wb": Channel(shots, quat, "1", "world"),
             "thrust_command": Channel(times, sent[:, None] / world["top"], "N"),
@@ -292,22 +292,22 @@ def recorded(
     )
 
 
-def asked(seed: int) -> dict:
+def diagnose_world(seed: int) -> dict:
     """A world, and what the tool says of it."""
     name, hidden, world = drawn(seed)
     line = {"seed": seed, "vehicle": name, "hidden": hidden}
     begin = time.process_time()
     try:
         logs = [flown(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
-        said = diagnose_flights.explain(FlyerModel(logs, known(name)), seed=seed)
+        diagnosis = diagnose_flights.explain(FlyerModel(logs, known(name)), seed=seed)
     except (VisthrowError, ValueError, FloatingPointError) as error:
         return line | {"verdict": "failed", "why": str(error)[:200]}
-    groups = [{f.name, *f.partners} for f in said.findings if f.name in said.theta]
+    groups = [{f.name, *f.partners} for f in diagnosis.findings if f.name in diagnosis.theta]
     return line | {
-        "verdict": said.overall,
+        "verdict": diagnosis.overall,
         "groups": [sorted(g) for g in groups],
-        "laws": [law.formula for law in said.laws[:1]],
-        "judged": judged(hidden, groups, said.overall),
+        "laws": [law.formula for law in diagnosis.laws[:1]],
+        "judged": judged(hidden, groups, diagnosis.overall),
         "seconds": time.process_time() - begin,
     }
 
@@ -322,12 +322,12 @@ def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
         if overall in ("UNKNOWN", "EXPLAINED IN PART"):
             return "part" if groups else "unknown"
         return "false" if groups else "missed"
-    own = [g for g in groups if hidden in g]
-    if not own:
+    hits = [g for g in groups if hidden in g]
+    if not hits:
         return "false" if groups else "missed"
-    fits = own[0] == {hidden} or any(own[0] <= alike for alike in ALIKE)
+    fits = hits[0] == {hidden} or any(hits[0] <= alike for alike in ALIKE)
     return (
-        ("right" if own[0] == {hidden} else "class")
+        ("right" if hits[0] == {hidden} else "class")
         if fits and all(hidden in g for g in groups)
         else "false"
     )
@@ -346,7 +346,7 @@ def main() -> None:
         mp.get_context("spawn").Pool(args.jobs, maxtasksperchild=4) as pool,
         args.ledger.open("a") as ledger,
     ):
-        for line in pool.imap_unordered(asked, seeds):
+        for line in pool.imap_unordered(diagnose_world, seeds):
             ledger.write(json.dumps(line) + "\n")
             ledger.flush()
             count[

@@ -63,7 +63,7 @@ WIDTHS = (0.05, 3.0)  # from 50 to 90 % in log size: what is possible
 GRID = 160  # points of the grid of curves
 FEWEST = 6  # worlds of an effect for a curve of its own
 BINNED = 30  # worlds of an effect for counts in bins
-SEEN = ", camera"
+WITH_CAMERA = ", camera"
 
 
 def wilson(k: int, n: int, level: float = 0.95) -> tuple[float, float, float]:
@@ -142,11 +142,11 @@ def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1
     """
     least = size.min()
     most = size.max()
-    told = []
+    texts = []
     for x in found:
         sign = "<" if x < least else ">" if x > most else ""
-        told.append(f"{sign}{float(np.clip(x, least, most)) * scale:.2g}")
-    return "{} [{}, {}]".format(*told)
+        texts.append(f"{sign}{float(np.clip(x, least, most)) * scale:.2g}")
+    return "{} [{}, {}]".format(*texts)
 
 
 def met(found: tuple[float, float, float], limit: float) -> str:
@@ -187,22 +187,22 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
     ]
     for kind, begun in grouped(worlds, lambda w: w["kind"]).items():
         group = answered(begun)
-        told = [w for w in group if "error" not in w]
+        finished = [w for w in group if "error" not in w]
         counts = np.array([names(w) for w in group]).reshape(-1, 4)
         given, right, exact, found = map(int, counts.sum(0))
         hidden = sum(len(truth_of(w)) for w in group)
         more = sum(int(c[0] > len(truth_of(w))) for c, w in zip(counts, group))
         overall = [
-            sum(w["overall"].startswith(x) for w in told)
+            sum(w["overall"].startswith(x) for w in finished)
             for x in ("NO EFFECT", "KNOWN", "UNKNOWN", "DATA")
         ]
         seconds = (
-            f"{np.median([w['explain_s'] for w in told]):.0f}"
-            f" ({max(w['explain_s'] for w in told):.0f})"
-            if told
+            f"{np.median([w['explain_s'] for w in finished]):.0f}"
+            f" ({max(w['explain_s'] for w in finished):.0f})"
+            if finished
             else "-"
         )
-        row = [kind, len(group), len(group) - len(told), len(begun) - len(group)]
+        row = [kind, len(group), len(group) - len(finished), len(begun) - len(group)]
         row += [share(found, hidden), share(right, given), share(exact, given)]
         row += [share(more, len(group)), *overall, seconds]
         lines.append("| " + " | ".join(map(str, row)) + " |")
@@ -238,8 +238,10 @@ def singles(worlds: Sequence[dict]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         effects = w["recipe"]["effects"]
         if len(effects) == 1 and truth_of(w) and not dusty(w):
             ((name, theta),) = effects.items()
-            seen = w["recipe"].get("camera", False) and name not in CAMERA_FLOORS
-            out[name + SEEN * seen].append((abs(theta) / ALL_FLOORS[name], names(w)[3] == 1))
+            with_camera = w["recipe"].get("camera", False) and name not in CAMERA_FLOORS
+            out[name + WITH_CAMERA * with_camera].append(
+                (abs(theta) / ALL_FLOORS[name], names(w)[3] == 1)
+            )
     return {
         n: (np.array([s for s, _ in v]), np.array([k for _, k in v]))
         for n, v in sorted(out.items())
@@ -266,7 +268,7 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
         )
         limit, factor, unit = LIMITS.get(name, (math.nan, 1.0, "floors"))
         floor = ALL_FLOORS[name] if name in LIMITS else 1.0
-        asked = f"{limit * factor:.2g}" if name in LIMITS else "-"
+        required = f"{limit * factor:.2g}" if name in LIMITS else "-"
         row = [
             name,
             len(size),
@@ -282,9 +284,9 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
             half = fitted.size(0.5)
             most = fitted.size(0.9)
             row += [within(x, size, floor * factor) for x in (half, most)]
-            row += [asked, met(most, limit / floor)]
+            row += [required, met(most, limit / floor)]
         else:
-            row += ["-", "-", asked, "too few worlds" if name in LIMITS else "-"]
+            row += ["-", "-", required, "too few worlds" if name in LIMITS else "-"]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines
 
@@ -353,7 +355,7 @@ def gains(worlds: Sequence[dict]) -> list[str]:
     for kind, group in {**grouped(with_held, lambda w: w["kind"]), "all": with_held}.items():
         ratio = [(gain_ratio(w["held"]), bool(w["named"])) for w in group]
         every = [r for r, _ in ratio if math.isfinite(r)]
-        named = [r for r, told in ratio if told and math.isfinite(r)]
+        named = [r for r, any_named in ratio if any_named and math.isfinite(r)]
         worse = [
             (h["after"] - h["before"], h["samples"])
             for h in (w["held"] for w in group)
@@ -444,8 +446,8 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
     if worlds is not None:
         axis.plot(worlds[0] * scale, np.where(worlds[1], 1.03, -0.03), "|", color="C0", alpha=0.7)
     if worlds is None or len(worlds[0]) < FEWEST:
-        told = f"{0 if worlds is None else len(worlds[0])} worlds"
-        axis.text(0.5, 0.5, told, ha="center", transform=axis.transAxes, color="grey")
+        label = f"{0 if worlds is None else len(worlds[0])} worlds"
+        axis.text(0.5, 0.5, label, ha="center", transform=axis.transAxes, color="grey")
         return
     size, named = worlds
     grid = np.geomspace(0.9 * size.min(), 1.1 * size.max(), 100)
@@ -471,16 +473,16 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
 
 def summary(worlds: Sequence[dict]) -> str:
     """All tables as Markdown."""
-    told = answered(worlds)
+    answers = answered(worlds)
     parts = {
         "What was named": accuracy(worlds),
-        "By kind": kinds(told),
-        "By plant": plants(told),
-        "Completeness": completeness(told),
-        "Intervals": intervals(told),
-        "Gain on throws that were held back": gains(told),
-        "Laws outside the catalogue": laws(told),
-        "What went wrong": failures(told),
+        "By kind": kinds(answers),
+        "By plant": plants(answers),
+        "Completeness": completeness(answers),
+        "Intervals": intervals(answers),
+        "Gain on throws that were held back": gains(answers),
+        "Laws outside the catalogue": laws(answers),
+        "What went wrong": failures(answers),
     }
     return "\n".join(
         f"## {title}\n\n" + "\n".join(lines) + "\n" for title, lines in parts.items() if lines
@@ -497,9 +499,9 @@ def right(world: dict) -> bool:
     overall = world.get("overall")
     named = world.get("named")
     varies = recipe.get("varies") or {}
-    told = world.get("varies", ())
+    varying = world.get("varies", ())
     if recipe.get("lost"):
-        return overall == "KNOWN" and not named and "dropped_commands" in told
+        return overall == "KNOWN" and not named and "dropped_commands" in varying
     if recipe.get("days"):
         return (
             overall == "KNOWN"
@@ -508,7 +510,7 @@ def right(world: dict) -> bool:
         )
     if varies:
         expected = {RANDOM.get(name, f"{name}_by_flight") for name in varies}
-        return overall == "KNOWN" and not named and bool(expected & set(told))
+        return overall == "KNOWN" and not named and bool(expected & set(varying))
     if any(name in TERMS for name in recipe["effects"]):
         return bool(world.get("unknown")) and not named
     return (
@@ -522,8 +524,8 @@ def kinds(worlds: Sequence[dict]) -> list[str]:
     """How many worlds of each kind were told as what they are, and how they were told otherwise."""
     lines = ["| kind | told as what it is | else | seconds |", "|---|---|---|---|"]
     for kind, group in sorted(grouped(worlds, lambda w: w["kind"]).items()):
-        else_told = Counter(w.get("overall") for w in group if not right(w))
-        other = ", ".join(f"{overall} {count}" for overall, count in sorted(else_told.items()))
+        wrong_verdicts = Counter(w.get("overall") for w in group if not right(w))
+        other = ", ".join(f"{overall} {count}" for overall, count in sorted(wrong_verdicts.items()))
         seconds = np.median([w["explain_s"] for w in group])
         lines.append(
             f"| {kind} | {share(sum(map(right, group)), len(group))} | {other} | {seconds:.0f} |"

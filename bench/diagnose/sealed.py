@@ -160,19 +160,21 @@ def flight_log(record: dict, day: int | None = None) -> FlightLog:
     there are several.
     """
     t = record["time"]
-    seen = np.isfinite(record["pos"][:, 0])
-    ball_seen = np.isfinite(record["ball"][:, 0])
+    visible = np.isfinite(record["pos"][:, 0])
+    ball_visible = np.isfinite(record["ball"][:, 0])
     channels = {
-        "pos_w": Channel(t, np.nan_to_num(record["pos"]), "m", "world", seen),
-        "quat_wb": Channel(t, np.nan_to_num(record["quat"][:, [1, 2, 3, 0]]), "1", "world", seen),
-        "payload_pos_w": Channel(t, np.nan_to_num(record["ball"]), "m", "world", ball_seen),
+        "pos_w": Channel(t, np.nan_to_num(record["pos"]), "m", "world", visible),
+        "quat_wb": Channel(
+            t, np.nan_to_num(record["quat"][:, [1, 2, 3, 0]]), "1", "world", visible
+        ),
+        "payload_pos_w": Channel(t, np.nan_to_num(record["ball"]), "m", "world", ball_visible),
         "command": Channel(record["sent_time"], record["sent"], "N, rad/s", "body"),
         "battery_voltage": Channel(record["sent_time"], record["volt"], "V"),
     }
-    asked = np.zeros(len(record["sent_time"]))
+    release_command = np.zeros(len(record["sent_time"]))
     if record["release"] is not None:
-        asked[record["sent_time"] >= record["release"] - 1e-9] = 1.0
-    channels["release_command"] = Channel(record["sent_time"], asked, "1")
+        release_command[record["sent_time"] >= record["release"] - 1e-9] = 1.0
+    channels["release_command"] = Channel(record["sent_time"], release_command, "1")
     if "look" in record:
         kept = ~record["look_lost"]
         stamps = record["look_time"]
@@ -327,7 +329,7 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
     named. A law outside the catalogue has no name: it is ``unknown`` that is right."""
     truth = {n for n in recipe.effects if not n.startswith("law_")}
     groups = named_by(verdict)
-    own = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
+    covered = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
     stands_for = matched(groups, truth)
     exact = sum(group == {name} for group, name in zip(groups, stands_for))
     hits = set(stands_for) - {""}
@@ -340,14 +342,14 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
         "named": [sorted(g) for g in groups],
         "overall": verdict["overall"],
         "extra": max(len(groups) - len(truth), 0),
-        "own_class": own,
+        "own_class": covered,
         "unknown": verdict["overall"].startswith("UNKNOWN"),
         "laws": [law["formula"] for law in verdict.get("laws", ())[:3]],
-        "varies": [own["name"] for own in verdict.get("scatter", ()) if own["found"]],
+        "varies": [row["name"] for row in verdict.get("scatter", ()) if row["found"]],
         "drifts": [
-            own["of"]
-            for own in verdict.get("scatter", ())
-            if own["found"] and own.get("by") == "day"
+            row["of"]
+            for row in verdict.get("scatter", ())
+            if row["found"] and row.get("by") == "day"
         ],
     }
 
@@ -356,13 +358,13 @@ def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
     """Of each hidden effect, what its own finding says: named or not, estimate, deviation,
     interval, evidence.
     """
-    own = {f["name"]: f for f in verdict["findings"]}
+    findings = {f["name"]: f for f in verdict["findings"]}
     kept = ("verdict", "estimate", "sd", "low", "high", "floor", "nats")
     return [
-        {"name": name, "truth": theta, "named": own[name]["verdict"] in ("FOUND", "CLASS")}
-        | {k: own[name].get(k) for k in kept}
+        {"name": name, "truth": theta, "named": findings[name]["verdict"] in ("FOUND", "CLASS")}
+        | {k: findings[name].get(k) for k in kept}
         for name, theta in recipe.effects.items()
-        if name in own
+        if name in findings
     ]
 
 
@@ -626,9 +628,15 @@ def main() -> None:
             tally[line["kind"]].update(
                 ["worlds"] + ["failed"] * failed + [k for k in JUDGED if line.get(k) and not failed]
             )
-            told = {k: line.get(k) for k in ("overall", "named", "explain_s", "error") if k in line}
+            outcome = {
+                k: line.get(k) for k in ("overall", "named", "explain_s", "error") if k in line
+            }
             print(
-                line["kind"], line["recipe"]["plant"], line["recipe"]["effects"], told, flush=True
+                line["kind"],
+                line["recipe"]["plant"],
+                line["recipe"]["effects"],
+                outcome,
+                flush=True,
             )
     for kind, count in tally.items():
         print(kind, dict(count))

@@ -23,14 +23,14 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     """
     channels = len(model.channels)
     priors = Priors.of(model.effects, model.channels)
-    told = [model.windows(theta) for theta in sizes]
-    raw = [[gram_of(w, priors.floor, channels) for w in windows] for windows in told]
-    noise, _ = levels.fit(told[-1], raw[-1])
+    windows_by_size = [model.windows(theta) for theta in sizes]
+    raw = [[gram_of(w, priors.floor, channels) for w in windows] for windows in windows_by_size]
+    noise, _ = levels.fit(windows_by_size[-1], raw[-1])
     squares = []
-    for windows, grams in zip(told, raw):
+    for windows, grams in zip(windows_by_size, raw):
         shaped = correlated_of(grams, windows, noise.correlation_time)
         statistics = Integrals(shaped, noise).statistics(shaped, np.zeros(len(priors.floor)))
         squares.append(statistics.square.sum())
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(
-        len(w.residual) for w in told[-1]
+        len(w.residual) for w in windows_by_size[-1]
     )

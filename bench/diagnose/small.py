@@ -107,13 +107,13 @@ def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> Flight
     helped = 1.0 / (1.0 - (CRAFT["disc"] / (4.0 * height)) ** 2) if law else 1.0
     a = CRAFT["map"][2]
     b = CRAFT["map"][1]
-    wanted = np.tile((carried / helped)[:, None], (1, 4)) * (
+    thrust = np.tile((carried / helped)[:, None], (1, 4)) * (
         1.0 + rng.normal(0.0, 0.1, (len(stamps), 4))
     )
     return FlightLog(
         {
             "motor_command": Channel(
-                stamps, (-b + np.sqrt(b * b + 4.0 * a * wanted)) / (2.0 * a), "1"
+                stamps, (-b + np.sqrt(b * b + 4.0 * a * thrust)) / (2.0 * a), "1"
             ),
             "pos_w": Channel(stamps, place + rng.laplace(0.0, 5e-4, place.shape), "m", "world"),
             "vel_w": Channel(stamps, speed, "m/s", "world"),
@@ -143,18 +143,18 @@ def formula(kind: str, law: str) -> str:
     return PULLS[law][0] if kind == "pendulum" else GROUND
 
 
-def asked(kind: str, law: str, seed: int) -> dict:
+def diagnose_world(kind: str, law: str, seed: int) -> dict:
     """A world, and what the tool says of it."""
     line = {"kind": kind, "law": law, "seed": seed}
     try:
-        said = diagnose_flights.explain(model_of(kind, logs_of(kind, law, seed)), seed=seed)
+        diagnosis = diagnose_flights.explain(model_of(kind, logs_of(kind, law, seed)), seed=seed)
     except (VisthrowError, ValueError, FloatingPointError) as error:
         return line | {"verdict": "failed", "why": str(error)[:200]}
     return line | {
-        "verdict": said.overall,
-        "named": list(said.theta),
-        "laws": [x.formula for x in said.laws[:3]],
-        "seconds": said.seconds,
+        "verdict": diagnosis.overall,
+        "named": list(diagnosis.theta),
+        "laws": [x.formula for x in diagnosis.laws[:3]],
+        "seconds": diagnosis.seconds,
     }
 
 
@@ -168,7 +168,7 @@ def main() -> None:
         for kind, (*_, laws) in WORLDS.items():
             for law in laws:
                 for seed in range(args.seeds):
-                    ledger.write(json.dumps(asked(kind, law, seed)) + "\n")
+                    ledger.write(json.dumps(diagnose_world(kind, law, seed)) + "\n")
                     ledger.flush()
 
 

@@ -270,12 +270,12 @@ def names_right(line: dict, side: str) -> bool:
 def varies_right(line: dict, side: str) -> bool:
     """Tell whether what differed by flight, day or command is stated, and nothing is named."""
     answer = line[side]
-    wanted = line["kind"].rpartition(":")[2]
+    expected = line["kind"].rpartition(":")[2]
     if line["kind"] == "lost":
         return not answer["named"] and "dropped_commands" in answer["varies"]
     if line["kind"].startswith(sealed.DRIFTING):
-        return not answer["named"] and any(wanted in of for of in answer["drifts"])
-    stated = any(wanted in name or name == RANDOM.get(wanted) for name in answer["varies"])
+        return not answer["named"] and any(expected in of for of in answer["drifts"])
+    stated = any(expected in name or name == RANDOM.get(expected) for name in answer["varies"])
     return not answer["named"] and stated
 
 

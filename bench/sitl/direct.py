@@ -227,14 +227,14 @@ def main() -> None:
         summary = report.pop("run")
         landed = report["landing_w"]
         error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
-        told = {
+        row = {
             "seed": seed,
             "error": error,
             "state": summary["state"],
             "reason": summary["reason"],
             **report,
         }
-        print(json.dumps(told), flush=True)
+        print(json.dumps(row), flush=True)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     run.mkdir(parents=True, exist_ok=True)
     desk = bench.Bench(run, settings)
     backend = Held(desk.backend, params.delay.hold)
-    seen = FlightRecorder({"source": "doublets"})
+    recorder = FlightRecorder({"source": "doublets"})
     mocap = Mocap(FakeMocapParams(), seed)
     rng = np.random.default_rng(seed)
     plant = desk.plant
@@ -114,7 +114,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                     doublet[1] if plant.time - doublet[2] < doublet[3] - 1e-6 else -doublet[1]
                 )
             backend.send(command, plant.time)
-            seen.add(plant.time, command=command)
+            recorder.add(plant.time, command=command)
             backend.service(plant.time)
             for _ in range(round(bench.TICK / PERIOD)):
                 now = plant.look()
@@ -134,10 +134,10 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                         if pose.body == PAYLOAD
                         else {"pos_w": pose.pos, "quat_wb": pose.quat}
                     )
-                    seen.add(plant.time, **ours)
+                    recorder.add(plant.time, **ours)
     finally:
         desk.close()
-    seen.log().save(folder / "doublets.npz")
+    recorder.log().save(folder / "doublets.npz")
     return {"rows": np.array(rows), "starts": np.array(starts)}
 
 
@@ -202,7 +202,7 @@ class Windows:
         c = vehicle.controller
         rows = self.flight
         late = np.searchsorted(rows[:, 0], rows[:, 0] - vehicle.queue.delay + 1e-6) - 1
-        asked = rows[np.maximum(late, 0), 15:18]
+        rate_command = rows[np.maximum(late, 0), 15:18]
         rate = rows[:, 1:4]
 
         def smoothed(values: np.ndarray, time_constant: float) -> np.ndarray:
@@ -211,12 +211,14 @@ class Windows:
                 [share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1]
             )[0]
 
-        setpoint = smoothed(asked, c.setpoint_time_constant)
+        setpoint = smoothed(rate_command, c.setpoint_time_constant)
         gyro = smoothed(rate, c.gyro_time_constant)
         if c.kind != "motor_mixing":
             return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
-        error = asked - rate - np.array(c.gyro_share) * (gyro - rate)
-        error[:, :2] *= np.maximum(1.0 - np.abs(asked - setpoint)[:, :2] / c.relax_threshold, 0.0)
+        error = rate_command - rate - np.array(c.gyro_share) * (gyro - rate)
+        error[:, :2] *= np.maximum(
+            1.0 - np.abs(rate_command - setpoint)[:, :2] / c.relax_threshold, 0.0
+        )
         return {
             "setpoint": setpoint,
             "gyro": gyro,
@@ -344,7 +346,7 @@ def main() -> None:
     flight = dict(np.load(file))
     windows = Windows(flight, args.policy)
     every = np.arange(len(windows.rows))
-    seen = every[every % 3 != 2]
+    fit_windows = every[every % 3 != 2]
     held_out = every[every % 3 == 2]
     shipped = windows.plant.vehicle
     configured = config.load(VehicleParams, config.find("vehicle", "betaflight_sitl"))
@@ -355,7 +357,7 @@ def main() -> None:
         shipped, settings, weight, calibrated_voltage(shipped, settings, weight, hover)
     )
     named = dataclasses.replace(shipped, controller=alone)
-    theta, rest = fit(windows, named, seen)
+    theta, rest = fit(windows, named, fit_windows)
     fitted = changed(named, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
@@ -367,7 +369,7 @@ def main() -> None:
             dataclasses.replace(configured, queue=fitted.queue), held_out, rest
         ),
         "fitted": windows.miss(fitted, held_out, rest),
-        "seen": windows.miss(fitted, seen, rest),
+        "seen": windows.miss(fitted, fit_windows, rest),
         **{
             name: float(v if k < 2 else np.exp(v - 1.0))
             for k, (name, v) in enumerate(zip(NAMES, theta))

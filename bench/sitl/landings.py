@@ -31,10 +31,10 @@ wait of `delay.hold` [s].
 
 def errors(logs: list[str], plant: str, theta: dict[str, float] | None = None) -> np.ndarray:
     """Horizontal distance of predicted from measured landings [m], shape (F,)."""
-    told = argparse.Namespace(
+    args = argparse.Namespace(
         logs=logs, plant=plant, overrides=[], config=None, only=None, measured=[], device="cpu"
     )
-    model = opening.Opened(told).model
+    model = opening.Opened(args).model
     return model.landings(theta or {}).errors
 
 

@@ -112,12 +112,12 @@ def flown(folder: Path, seconds: float, speed: float) -> dict:
         json.loads((folder / name).read_text()) for name in ("run/summary.json", "bridge.json")
     )
     p50, p99 = (1e3 * float(np.quantile(wire.times(), share)) for share in (0.5, 0.99))
-    own = summary["latency"]["total"]
+    total = summary["latency"]["total"]
     return {
         "commands": len(wire.commands),
         "poses": len(wire.poses),
         "pose_to_command_ms": {"p50": p50, "p99": p99},
-        "own_ms": {"p50": own["p50_ms"], "p99": own["p99_ms"]},
+        "own_ms": {"p50": total["p50_ms"], "p99": total["p99_ms"]},
         "late_periods": report["late_periods"],
         "periods": round(report["time"] / 0.002),
         "missed_ticks": summary["missed"],

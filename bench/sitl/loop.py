@@ -98,10 +98,10 @@ def table(record: dict) -> str:
                     t for t in one["throws"] if t["where"] == where and t["distance"] == distance
                 ]
                 errors = [t["error"] for t in throws if t["error"] is not None]
-                told = (
+                text = (
                     f"{np.mean(errors):.3f} m (to {max(errors):.3f})" if errors else "none landed"
                 )
-                cells.append(f"{told}, {len(errors)} of {len(throws)}")
+                cells.append(f"{text}, {len(errors)} of {len(throws)}")
             out.append(f"| {name}, {one['policy']}, {words} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 

@@ -74,7 +74,7 @@ def marks(
     turned = LOOKING_DOWN @ small_turn(w.camera_turn).T
     to_camera = np.einsum("ij,tkj->tik", turned, body)
     corners = np.einsum("tij,tkj->tki", to_camera, goal * [1.0, 1.0, 0.0] + SQUARE - lens[:, None])
-    points, seen = imaged(corners, w)
+    points, visible = imaged(corners, w)
     ring = outline(np.einsum("tij,tj->ti", to_camera, ball - lens), BALL * (1.0 + w.camera_ball))
     around, whole = imaged(ring, w)
     left, top = around.min(1).T
@@ -83,7 +83,7 @@ def marks(
     v = 0.5 * (top + bottom)
     box = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)
     return np.concatenate([points, box], 1), np.concatenate(
-        [seen, np.tile(whole.all(1)[:, None], 4)], 1
+        [visible, np.tile(whole.all(1)[:, None], 4)], 1
     )
 
 
@@ -105,13 +105,13 @@ def looked(
         (N,); ``goal``.
     """
     stamps = np.arange(0.1, flight.time[-1] - 1e-9, 1.0 / RATE)
-    points, seen = marks(flight, lane, stamps - w.camera_late, goal, w)
+    points, visible = marks(flight, lane, stamps - w.camera_late, goal, w)
     # each point's row has its own time; that it moves meanwhile by a row or so matters to nothing
     if w.camera_row:
         for k in range(points.shape[1]):
             then = stamps - w.camera_late + w.camera_row * points[:, k, 1]
-            points[:, k], seen[:, k] = (x[:, k] for x in marks(flight, lane, then, goal, w))
-    seen[stamps > landed, 4:] = False
+            points[:, k], visible[:, k] = (x[:, k] for x in marks(flight, lane, then, goal, w))
+    visible[stamps > landed, 4:] = False
     off = noise * PIXEL * rng.normal(size=points.shape)
     left = off[:, 4, 0]
     top = off[:, 5, 1]
@@ -123,8 +123,8 @@ def looked(
     look = (points + off - CENTRE) / (FOCAL * HALF_VIEW)
     return {
         "look_time": stamps,
-        "look": np.where(seen[..., None], look, 0.0),
-        "look_seen": seen,
+        "look": np.where(visible[..., None], look, 0.0),
+        "look_seen": visible,
         "look_lost": rng.random(len(stamps)) < dropouts,
         "goal": goal,
     }

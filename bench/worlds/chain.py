@@ -219,15 +219,15 @@ class Chain:
         self._view["before"][:] = self.bodies
         self.ball_x = np.zeros((count, 3))
         self.tension = np.array([9.81 * (w.ball_mass + w.rope_mass) for w in worlds])
-        self._seen = 0.0
+        self._last_look = 0.0
         self.look(1.0)
 
     def look(self, now: float) -> None:
         """Positions and velocities of the hanging balls, and the ropes' tension from what they did
         since the last look.
         """
-        since = max(now - self._seen, 1e-4)
-        self._seen = now
+        since = max(now - self._last_look, 1e-4)
+        self._last_look = now
         out = np.zeros(6)
         for e in np.flatnonzero(self.hanging):
             m = self.models[e]

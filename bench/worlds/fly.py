@@ -264,7 +264,7 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
     quat[:, 0] = (1.0, 0.0, 0.0, 0.0)
     rate[:, 0] = 0.0
     ball[:, 0] = [s + w.mount - [0, 0, w.length + w.ball_reach] for s, w in zip(starts, worlds)]
-    asked = np.full(lanes, np.inf)
+    release_time = np.full(lanes, np.inf)
     link = np.random.default_rng([seed, 9])
     for k in range(ticks):
         t = k * PERIOD
@@ -273,8 +273,8 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         sent[:, k] = pilots(t, pos[:, now], b["v"], b["q"], hanging)
         volts[:, k] = b["volt"]
         for e, (w, reference) in enumerate(zip(worlds, references)):
-            if not np.isfinite(asked[e]) and t >= reference.release - 1e-9:
-                asked[e] = t
+            if not np.isfinite(release_time[e]) and t >= reference.release - 1e-9:
+                release_time[e] = t
                 excess = tension[e] - EARTH * w.ball_mass
                 plant.latch(
                     e, t + w.release_lag + w.lag_per_newton * excess + w.lag_jitter * jitter[e]
@@ -292,5 +292,5 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         )
     time = np.arange(ticks * RECORDS + 1) * PERIOD / RECORDS
     return Flights(
-        time, pos, quat, ball, sent, asked, plant.rides.numpy()["separated_at"], rate, volts
+        time, pos, quat, ball, sent, release_time, plant.rides.numpy()["separated_at"], rate, volts
     )

@@ -26,7 +26,7 @@ class Table:
     yaw: np.ndarray  # [rad], shape (N,)
     added: np.ndarray  # to the commanded rates [rad/s], shape (N, 3)
     factor: np.ndarray  # on the commanded thrust, shape (N,)
-    asked: np.ndarray  # release command, shape (N,)
+    release_command: np.ndarray  # shape (N,)
     payload: bool = True
 
     @property
@@ -42,7 +42,7 @@ class Table:
     @property
     def release(self) -> float:
         """When the release is commanded [s]; infinite where it is not."""
-        rows = np.flatnonzero(self.asked > 0.5)
+        rows = np.flatnonzero(self.release_command > 0.5)
         if not self.payload:
             return 0.0
         return self.begin + 0.02 * rows[0] if len(rows) else np.inf
@@ -130,11 +130,11 @@ def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
 
 
 def _trimmed(record: dict, table: Table) -> dict:
-    seen = (record["time"] >= table.begin) & (record["time"] < table.seconds)
+    in_window = (record["time"] >= table.begin) & (record["time"] < table.seconds)
     sent = (record["sent_time"] >= table.begin - 1e-9) & (
         record["sent_time"] < table.seconds - 1e-9
     )
-    record = record | {name: record[name][seen] for name in ("time", "pos", "quat", "ball")}
+    record = record | {name: record[name][in_window] for name in ("time", "pos", "quat", "ball")}
     record |= {name: record[name][sent] for name in ("sent_time", "sent", "volt")}
     return (
         record

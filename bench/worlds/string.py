@@ -129,17 +129,17 @@ def build(nodes: int = 24):
         for i in range(N):  # forward sweep of the tridiagonal system in the tensions
             n = normal[i]
             free_here = gravity + side[i] / node_mass(p, i)
-            free_there = mount_a
+            free_above = mount_a
             tail = mount
             tail_v = mount_v
-            weight_there = wp.dot(n, mobility * n)
-            coupling_there = REAL(0.0)
+            weight_above = wp.dot(n, mobility * n)
+            coupling_above = REAL(0.0)
             if i > 0:
-                free_there = gravity + side[i - 1] / node_mass(p, i - 1)
+                free_above = gravity + side[i - 1] / node_mass(p, i - 1)
                 tail = place[i - 1] + V3()
                 tail_v = speed[i - 1] + V3()
-                weight_there = REAL(1.0) / node_mass(p, i - 1)
-                coupling_there = wp.dot(n, normal[i - 1]) / node_mass(p, i - 1)
+                weight_above = REAL(1.0) / node_mass(p, i - 1)
+                coupling_above = wp.dot(n, normal[i - 1]) / node_mass(p, i - 1)
             d_x = place[i] - tail
             d_v = speed[i] - tail_v
             size = wp.length(d_x)
@@ -147,18 +147,18 @@ def build(nodes: int = 24):
             rest = bit + REAL(0.0)
             if i == N - 1:
                 rest = bit + p.ball_reach
-            right = wp.dot(n, free_here - free_there) + (wp.dot(d_v, d_v) - along * along) / size
+            right = wp.dot(n, free_here - free_above) + (wp.dot(d_v, d_v) - along * along) / size
             right += REAL(2.0) * w0 * along + w0 * w0 * (size - rest)
             # The rope gives, not the ball at its end.
             diagonal = (
                 REAL(1.0) / node_mass(p, i)
-                + weight_there
-                - coupling_there * below
+                + weight_above
+                - coupling_above * below
                 + w0 * w0 * bit * p.stretch
             )
             known = right + REAL(0.0)
             if i > 0:
-                known = right + coupling_there * pull[i - 1]
+                known = right + coupling_above * pull[i - 1]
             next_coupling = REAL(0.0)
             if i < N - 1:
                 tail_n = place[i + 1] - place[i]

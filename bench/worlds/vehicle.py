@@ -163,7 +163,7 @@ def along(b: Body, d: Body, h: REAL):
 def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
     """Wanted rotor speeds; fills the derivatives of integral and filters into ``rates``."""
     out = rates
-    asked = V3(command[1], command[2], command[3])
+    rate_command = V3(command[1], command[2], command[3])
     mean_x = REAL(0.0)
     mean_y = REAL(0.0)
     for i in range(4):
@@ -174,9 +174,11 @@ def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
     ratio = b.volt / p.nominal_voltage
     if p.geometric == 1:
         jw = wp.cw_mul(p.believed_inertia, b.w)
-        torque = p.geometric_gain * wp.cw_mul(p.believed_inertia, asked - b.w) + wp.cross(b.w, jw)
+        torque = p.geometric_gain * wp.cw_mul(p.believed_inertia, rate_command - b.w) + wp.cross(
+            b.w, jw
+        )
     else:
-        out.stick = (asked - b.stick) / p.stick_lag
+        out.stick = (rate_command - b.stick) / p.stick_lag
         out.gyro = (b.w - b.gyro) / p.gyro_lag
         torque = wp.cw_mul(p.kp, b.stick - b.w) + b.integral
         torque += wp.cw_mul(p.kf, out.stick) - wp.cw_mul(p.kd, out.gyro)

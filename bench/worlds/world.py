@@ -168,11 +168,11 @@ def worlds_of(recipe: Recipe, first: int, count: int) -> list:
     """The worlds of some flights, each with what it has of its own."""
     out = []
     for flight in range(first, first + count):
-        own = np.random.default_rng(
+        rng = np.random.default_rng(
             [recipe.seed, 8, flight % recipe.days if recipe.days else flight]
         )
         sizes = {
-            name: float(deviation * own.standard_normal())
+            name: float(deviation * rng.standard_normal())
             for name, deviation in recipe.varies.items()
         }
         world = world_of(recipe)
