@@ -1,9 +1,9 @@
 """The paper's ablations as hidden defects: a model that lacks a block is compared with flights of a
 plant that has it.
 
-The shipped policy throws on the reference plant, which has everything; the same flights are
-diagnosed with four models, each without one block. What must be named is the block. Nothing is
-trained. Throws that no diagnosis saw say what the name is worth.
+The shipped policy throws on the reference plant, which has every block. The same flights are
+diagnosed with four models, each without one block. The diagnosis must name that block. Nothing is
+trained. Throws that the diagnosis did not use measure what the name gains.
 
     python -m bench.ablations                 all four; minutes on two cores
     python -m bench.ablations no_motor_lag    one of them
@@ -45,7 +45,7 @@ block back.
 """
 
 COMMITTED = Path(__file__).parent / "loops" / "ablations" / "record.json"
-"""Record of the last round that is told of."""
+"""The committed record of the last round."""
 
 SETTLED = 2.4
 AFTERWARDS = 0.7
@@ -63,11 +63,11 @@ class Ablations:
     """One round over models that lack a block.
 
     Attributes:
-        folder: of flights, verdicts and the record; what is there is not done again.
+        folder: of flights, verdicts and the record; existing files are kept.
         names: of :data:`LACKS`.
         policy: shipped name or file.
         flights: to be diagnosed.
-        held: further throws, which no diagnosis sees.
+        held: further throws, held out from the diagnosis.
         device: of the diagnosis.
     """
 
@@ -79,7 +79,7 @@ class Ablations:
     device: str = "cpu"
 
     def run(self, say: Callable[[str], None]) -> dict[str, Any]:
-        """Fly, diagnose with each model, weigh on what was held back; returns the record.
+        """Fly, diagnose with each model, compare on the held-out throws; returns the record.
 
         Raises:
             DiagnoseError: An ablation that does not exist.
@@ -105,7 +105,7 @@ class Ablations:
         """Logs of throws at targets all around, by the policy as it was trained, on the plant that
         has everything.
 
-        Of those held back somebody noted where they came down.
+        Logs of the held-out throws hold their landing points.
         """
         count = self.flights + self.held
         paths = [self.folder / "flights" / f"flight_{i:02d}.npz" for i in range(count)]
@@ -220,7 +220,7 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
 def on_held_back(
     base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str
 ) -> dict[str, Any]:
-    """What a verdict is worth on throws that it was not found in.
+    """Likelihood and landing errors of a verdict on held-out throws.
 
     Returns:
         ``before``, ``after``: nats by which the throws are explained worse by the model as it was,

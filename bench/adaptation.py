@@ -1,10 +1,10 @@
 """Adaptation of the shipped state policy to altered vehicles: landing error before and after a
 short training from it.
 
-The alterations are the effects of the committed loops. What one costs is the policy's mean error on
-the altered vehicle beyond that on its own; the share of it that the training wins back is the
-figure. All throws are those of the training's simulator, with all noise, from the same seed. What
-is in the folder is not done again.
+The alterations are the effects of the committed loops. Each increases the policy's mean error over
+that on its original vehicle; the table shows the share of this increase that the training removes.
+All throws are flown in the training simulator, with all noise, from the same seed. Results in the
+folder are reused.
 
     python -m bench.adaptation --device cuda
     python -m bench.adaptation --device cpu --seconds 120 --only release_lag
@@ -39,8 +39,8 @@ STAGES = ("home", "before", "after")
 def adapted(
     experiment: Experiment, policy: Policy, args: argparse.Namespace
 ) -> tuple[Policy, dict[str, float]]:
-    """The policy after a training in full, or what the seconds allow of it; its seconds, building
-    left out, and its iterations.
+    """The policy after a full training, or one cut at ``--seconds``; its seconds without the
+    set-up, and its iterations.
     """
     trainer = Trainer(fitted(experiment, policy), args.device, args.seed)
     spent = 0.0

@@ -1,5 +1,5 @@
-"""The baseline's throws that the report stands on: flies what no record holds, and writes the
-record anew.
+"""The baseline's throws behind the report: flies those that no record holds, and rewrites the
+record.
 """
 
 import argparse
@@ -44,7 +44,9 @@ def _settings(speeds: tuple[float, ...] = front.SPEEDS) -> Iterator[dict[str, fl
 
 
 def _front() -> Iterator[dict[str, Any]]:
-    """The sweep in the own model and, all delays made up for, in the training simulator."""
+    """The sweep in the baseline's model and, with all delays compensated, in the training
+    simulator.
+    """
     for bounds in BOUNDS[::-1]:
         for how in _settings():
             yield from thrower.units(
@@ -56,7 +58,7 @@ def _front() -> Iterator[dict[str, Any]]:
 
 
 def _late_front() -> Iterator[dict[str, Any]]:
-    """The sweep where the release's lag is not made up for."""
+    """The sweep without compensation of the release's lag."""
     for how in _settings():
         yield from thrower.units("hybrid", "delay", FRONT_TARGET, FRONT_THROWS, **how)
 
@@ -75,7 +77,7 @@ def _on_reference(
 
 def run(args: argparse.Namespace) -> int:
     """Fly and write."""
-    importlib.import_module("piqp")  # said here rather than by every worker
+    importlib.import_module("piqp")  # printed once, not by every worker
     path = Path(args.records) / "throws" / "baseline.json"
     known = results.load_all([path])
     found = results.work(

@@ -65,7 +65,7 @@ class Views:
         ).contiguous()
 
     def keypoints(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Ours, all of it: frames, ball's outline, projection, box, validity."""
+        """Our whole computation: frames, ball's outline, projection, box, validity."""
         return keypoints(self.camera, self.pos_w, self.rot_wb, self.goal_w, self.payload_w)
 
 

@@ -56,18 +56,18 @@ LEVELS = {
 OTHER_LENS = "all, half; another lens"
 LEVELS[OTHER_LENS] = LEVELS["all, half"]
 BENT = {"fx": 232.0, "fy": 232.0, "k1": 0.05, "k2": -0.006, "fov_deg": 145.0}
-"""A lens beyond those of the training: longer by 1.4, where they reach 1.35, and bent outwards by
-0.05, where they reach 0.02.
+"""A lens outside the training's range: focal length 1.4 times (training: up to 1.35), distortion
+0.05 outwards (training: up to 0.02).
 """
 
 HIT = 4.0  # a detection whose points are off by more than this on average is of something else [px]
 
 PRIORS = ("nothing", "pose", "track")
-"""What detectors are told besides the picture: nothing; attitude and height; also where the ball
-was a frame ago, and how far it can be while it hangs. The runner tells all of it.
+"""Inputs of the detectors besides the image: none; attitude and height; also the ball's position in
+the last frame, and its distance limit while it hangs. The runner passes all of them.
 """
 
-# of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s
+# change of the ball's direction since the last frame [rad]: 20 ms at 3.5 rad/s
 TRACK_ERROR = math.radians(4.0)
 
 
@@ -118,8 +118,8 @@ def run(args: argparse.Namespace) -> None:
 
 
 def mistaken(detectors: dict) -> dict[str, Any]:
-    """Balls and squares that detectors report in photographs that show neither, nine cuts of each;
-    nothing is told to them.
+    """Balls and squares that detectors report in photographs that show neither, nine crops of each;
+    without any prior input.
     """
 
     counts: dict[str, Any] = {"looks": 0} | {name: {"ball": 0, "goal": 0} for name in detectors}
@@ -150,8 +150,8 @@ def figures_of(
     mean probability less the hits.
 
     Args:
-        rows: of each frame and kind: the kind, whether it was there, whether it was reported, the
-            mean error of its points [px], and the probability that was reported.
+        rows: of each frame and kind: the kind, whether it was in view, whether it was reported, the
+            mean error of its points [px], and the reported probability.
         spent: times of the frames [s].
     """
     figures: dict[str, float] = {}
@@ -289,7 +289,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--known",
         default="pose",
         choices=PRIORS,
-        help="what the detectors are told; track: as in flight (default: pose)",
+        help="prior input of the detectors; track: as in flight (default: pose)",
     )
     add(
         "--textures",

@@ -1,12 +1,12 @@
-"""The throw of the fake autopilot without a wire, a line of JSON a seed: what the wire costs is
-measured against it.
+"""Throws of the fake autopilot without a wire, one line of JSON per seed: the reference for the
+wire's cost.
 
 Plant, start, motion capture, estimator and policy are those of a throw over the wire, with the same
 seeds; link, autopilot, state machine, processes and real time are left out; set-points act as late
 as the kind of autopilot lets them, which the estimator makes up for. Over the wire the runner's
-ticks and the motion capture know nothing of each other, so that at a tick the newest pose is as old
-as the latency and up to a period of the motion capture more. So here: the seed says by how many of
-the plant's periods ticks follow poses, and whether one that arrives at the instant of a tick is in
+ticks and the motion capture are not synchronised: at a tick the newest pose is as old as the
+latency and up to a period of the motion capture more. Here the seed draws by how many of the
+plant's periods ticks follow poses, and whether a pose that arrives at the instant of a tick is in
 time."""
 
 import argparse
@@ -35,8 +35,8 @@ from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy, find_policy
 
 SETTLED = 0.1
-"""What checks and arming take over the wire beyond the times that the configuration asks for [s]: 5
-ticks. A throw that begins at the same time meets the same noise.
+"""Time of checks and arming over the wire beyond the configured times [s]: 5 ticks. A throw that
+begins at the same time meets the same noise.
 """
 
 MOST = 8.0  # after which a throw is given up [s]
@@ -97,9 +97,7 @@ class Direct:
             self._tracks[pose.body].update(pose)
 
     def throw(self) -> dict[str, Any]:
-        """Hover where the vehicle is, as in other hands, then at the hover point, throw, wait for
-        the landing; its report.
-        """
+        """Hover in place, then at the hover point, throw, await the landing; returns its report."""
         latch = None
         start = None
         tick = self._phase * self.plant.period

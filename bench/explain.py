@@ -1,5 +1,5 @@
-"""How long a diagnosis takes: reading and the fit of initial states, the verdicts, the report; on
-the logs of one's own flights.
+"""Time of a diagnosis of given logs: reading and the fit of initial states, the verdicts, the
+report.
 
 python -m bench.explain flights/*.npz --no-report
 """
@@ -24,11 +24,11 @@ VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
 H200.
 """
 REPORT_S = 120.0
-"""What the report may take on top."""
+"""Additional time allowed for the report."""
 
 
 def measure(args: argparse.Namespace) -> dict[str, float]:
-    """Seconds of each stage of one diagnosis, and what was looked at."""
+    """Seconds of each stage of one diagnosis, and the numbers of flights and effects."""
     begun = time.perf_counter()
     source = opening.Opened(args)
     model = source.model

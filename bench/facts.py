@@ -1,4 +1,4 @@
-"""Compare the facts of firmwares with their sources: each row's words must stand on its line.
+"""Compare the facts of firmwares with their sources: each row's words must appear on its line.
 
     python -m bench.facts crazyflie=PATH betaflight=PATH
 

@@ -1,5 +1,5 @@
-"""What the runner does when something fails, and after how long: each fault over UDP between two
-processes, in real time.
+"""The runner's reactions to faults, and their delays: each fault over UDP between two processes, in
+real time.
 """
 
 import argparse
@@ -35,13 +35,13 @@ START = 2.5
 """When a fault begins [s]."""
 
 STARTS = 6.0
-"""For which a fake that is there first waits for its run [s]."""
+"""Time for which a fake that starts first waits for its run [s]."""
 
 ENOUGH = 6.0
-"""Time of a run that ends in its throw [s]: the fake's start, and what there is before a throw."""
+"""Time of a run that ends in its throw [s]: the fake's start, and the states before a throw."""
 
 LENGTHS = {MOCAP: 1.2, AUTOPILOT: 4.0, RUNNER: 2.5}
-"""How long it is watched [s]: a heartbeat may be missing for three."""
+"""Time of observation after a fault [s]: a heartbeat may be missing for three."""
 
 LATENCY = 0.01
 """Of the fake's motion capture, from a measurement to its arrival [s]."""
@@ -81,7 +81,7 @@ class Case:
         text: what happens. group: of the table. policy: of `POLICIES`.
         run: settings of the run. fake: arguments of the fake. spoiled: name and time of a fault of
             its motion capture.
-        act: done to the run's process in mid throw. since: what times count from: `START` on the
+        act: done to the run's process in mid-throw. since: what times count from: `START` on the
         vehicle's clock ("fault"), the deed ("act"), or the run's latch or first tick in a state.
         refused: whether the run does not even start. ends: whether it is a way for the run to end,
             and so flown with any kind.
@@ -143,7 +143,7 @@ ENDS = {
     "sighup": ("SIGHUP (ssh is gone, the terminal closed)", signal.SIGHUP),
     "killed": ("the runner is killed (SIGKILL)", signal.SIGKILL),
 }
-"""Ways for a run to be ended from outside, and the signals."""
+"""Ways to end a run from outside, and their signals."""
 
 HOVERS = ("states.armed_least=9.0",)
 """Armed it hovers, until its time for that is over."""
@@ -250,7 +250,7 @@ class Deed:
         self._thread: threading.Thread | None = None
 
     def __call__(self, pid: int) -> None:
-        """The run is there."""
+        """The run is ready."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._wait, args=(pid,), daemon=True)
             self._thread.start()
@@ -404,7 +404,7 @@ def _one(
     ticks = json_lines(folder / "ticks.jsonl")
     offset = _offset(ticks)
     begin = _begin(case, summary, ticks, offset, deed)
-    last = early + START + length - 0.1 + offset  # then the fake goes, which is none of these
+    last = early + START + length - 0.1 + offset  # then the fake ends, which is not counted
     began_in = before = next(
         (tick["state"] for tick in reversed(ticks) if tick["time"] < begin), None
     )

@@ -11,8 +11,7 @@ import numpy as np
 def bootstrap_upper(
     ratio_of: np.ndarray, level: float = 0.9, draws: int = 20_000, seed: int = 0
 ) -> tuple[float, float]:
-    """Ratio of the means of two columns of pairs, and the one-sided upper bound of it by drawing
-    pairs anew.
+    """Ratio of the means of two columns of pairs, and its one-sided upper bound by bootstrap.
 
     Args:
         ratio_of: shape (N, 2).
@@ -26,8 +25,8 @@ def bootstrap_upper(
 
 
 def json_lines(path: Path) -> list[dict[str, Any]]:
-    """Values of a file of lines; a last one that was cut short is left out, and so is a file that
-    is not there.
+    """Values of a file of JSON lines, without a truncated last line; none where the file is
+    missing.
     """
     found = []
     for row in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
@@ -39,5 +38,5 @@ def json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def finite(value: float | None) -> bool:
-    """Whether a figure is there and a number."""
+    """Whether a figure exists and is finite."""
     return value is not None and math.isfinite(value)

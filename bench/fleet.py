@@ -1,8 +1,7 @@
-"""A policy for many vehicles, thrown on vehicles it never saw, and beside policies trained for each
-of some.
+"""A policy for many vehicles, thrown on vehicles outside its training, and compared with policies
+trained for single vehicles.
 
-Errors are in units of the rope: metres at a rope of ``fleet.rope_length``, whatever a vehicle's own
-is.
+Errors are in units of the rope: metres scaled to a rope of ``fleet.rope_length``.
 
     python -m bench.fleet any any_vision --device cuda
     python -m bench.fleet any --rivals 20 --minutes 10 --device cuda  # resumes
@@ -32,11 +31,11 @@ NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 RIVAL = "state_fast"
 DRAWN = "drawn"
 SPECIALIST = "its own"
-"""What tables call all drawn vehicles, and a policy that was trained for one vehicle."""
+"""Labels in tables for all drawn vehicles, and for a policy that was trained for one vehicle."""
 THROWS = 1200
 """Throws at each target on one vehicle."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
-"""Of vehicles that are kept of a group of them."""
+"""Quantiles over a group's vehicles that are recorded."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
             )
         _write(folder, rows, {})
     for k, (rival, experiment) in rivals.items():
-        status(f"own policy on {_label(k)}")
+        status(f"specialised policy on {_label(k)}")
         rows += _thrown(SPECIALIST, rival, experiment, [_label(k)], THROWS, device, args.seed)
     status("")
     seconds = {k: rival.made_by["seconds"] for k, (rival, _) in rivals.items()}
@@ -162,7 +161,7 @@ def _thrown(
 def _rivals(
     experiment: Any, args: argparse.Namespace, folder: Path, device: str
 ) -> dict[str, tuple[Any, Any]]:
-    """Train a policy for each of some vehicles, as far as the time goes: vehicle -> policy and
+    """Train a policy for each of some vehicles until the time is over: vehicle -> policy and
     experiment.
     """
     from visthrow.onboard.policy import Policy
@@ -197,7 +196,7 @@ def _rivals(
 
 
 def _trained(experiment: Any, device: str) -> Any:
-    """Policy trained for an experiment; tells the seconds that it took."""
+    """Policy trained for an experiment, with its seconds in the provenance."""
     from visthrow.common import provenance
     from visthrow.task import contract_of
     from visthrow.training.trainer import Trainer
@@ -223,8 +222,8 @@ def _write(folder: Path, rows: Sequence[Row], seconds: dict[str, float]) -> Repo
 
 
 def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
-    """Report the drawn vehicles, the named, those with a policy of their own one by one and in the
-    mean.
+    """Report the drawn vehicles, the named, and those with a specialised policy one by one and in
+    the mean.
     """
 
     def cells(label: str, policy: str, vehicles: Sequence[str]) -> tuple[str, ...]:
@@ -239,7 +238,7 @@ def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
     names = list(dict.fromkeys(row.vehicle for row in rows))
     rivals = [_label(k) for k in seconds]
     groups = {DRAWN: [v for v in names if v.isdigit()]} | {v: [v] for v in names if not v.isdigit()}
-    groups |= {"those with a policy of their own": rivals} if len(rivals) > 1 else {}
+    groups |= {"those with a specialised policy": rivals} if len(rivals) > 1 else {}
     found = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))
     shown = [
@@ -280,8 +279,8 @@ def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
 def _spread(
     label: str, policy: str, vehicles: Sequence[str], rows: Sequence[Row]
 ) -> dict[str, Any]:
-    """How the vehicles' mean errors spread, at each target and over all of them; the rows
-    themselves are in ``fleet.csv``.
+    """Quantiles of the vehicles' mean errors, at each target and over all of them; the rows are in
+    ``fleet.csv``.
     """
     of = np.array(
         [

@@ -1,11 +1,11 @@
-"""Follow pages to the letter, as a stranger does: every block as it is shown, nothing added,
-nothing reused, processes of their own.
+"""Follow pages to the letter, as a new user does: every block as shown, nothing added, nothing
+reused, in separate processes.
 
     python -m bench.follow docs/howto/rope.md docs/howto/camera.md    # from the root of a
     clone, its environment active
 
-It prints minutes a block and a page, beside the processor's. What is marked with a reason of
-:data:`LEFT` is not followed."""
+It prints wall and processor minutes of blocks and pages. Blocks marked with a reason of
+:data:`LEFT` are skipped."""
 
 import argparse
 import os
@@ -29,11 +29,11 @@ LEFT = {
     "it opens a window",
     "many minutes",
 }
-"""Reasons for which a stranger with two cores and ten minutes skips a block, too."""
+"""Reasons for which a new user with two cores and ten minutes skips a block, too."""
 
 
 def follow(block: Block) -> bool:
-    """Do what a block says, in the working folder; returns whether all went well."""
+    """Run a block in the working folder; returns whether all commands succeeded."""
     if block.title:
         Path(block.title).write_text(block.text, encoding="utf-8")
         return True
@@ -47,7 +47,7 @@ def follow(block: Block) -> bool:
 
 
 def main() -> int:
-    """Follow the pages that are named; returns 1 where one stumbles."""
+    """Follow the named pages; returns 1 where a block fails."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

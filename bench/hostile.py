@@ -2,9 +2,9 @@
 
 python -m bench.hostile --source natnet --count 100000 --seeds 10
 
-Each throw is flown on poses that come through the source. From the throw's first tick on, cut,
-random and forged items come between them. What the runner decides must be what it decides without
-them, and each item must be counted."""
+Each throw is flown on poses that come through the source. From the throw's first tick on,
+truncated, random and forged items arrive between them. The runner's decisions must not change, and
+each item must be counted."""
 
 import argparse
 import math
@@ -39,7 +39,7 @@ STRANGER = ("127.0.0.9", 1511)
 IDS = {VEHICLE: 7, PAYLOAD: 8}
 NUMBERS = {body: str(number) for body, number in IDS.items()}
 AT_ONCE = 400
-"""Items beside the poses of one look: a source keeps 2000 poses between two looks."""
+"""Items beside the poses of one read: a source keeps 2000 poses between two reads."""
 
 QUICK = (
     "states.check_hold=0.2",
@@ -82,7 +82,7 @@ class NatNet:
         self._good: list[bytes] = []
 
     def deliver(self, pose: Pose) -> None:
-        """Hand over a pose as the source's own peer sends it."""
+        """Hand over a pose as the source's peer sends it."""
         self._good.append(frame(pose.stamp, (IDS[pose.body], pose.pos, pose.quat, True)))
         self.source.take(self._good[-1], HOST)
 
@@ -107,7 +107,7 @@ class NatNet:
 
 
 class Silent:
-    """As motioncapture.MotionCapture, for what the test's own thread makes of it."""
+    """A stand-in for motioncapture.MotionCapture that the test's thread reads."""
 
     def __init__(self) -> None:
         self.frames: list[Any] = []
@@ -240,7 +240,8 @@ READERS = {reader.kind: reader for reader in (NatNet, MotionCapture, Ros2)}
 
 
 def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
-    """Fly a throw beside hostile items: what was decided, the fake, the reader, and how many came.
+    """Fly a throw beside hostile items: the decisions, the fake, the reader, and the number of
+    items.
 
     Args:
         kind: of the source. seed: of the items. count: of items at most.
@@ -293,7 +294,7 @@ def judge(kind: str, seed: int, count: int) -> int:
     total = 0
     while total < count:
         decisions, fake, counted, sent = flown(kind, seed + 1000 * total, count - total)
-        assert sent, "a throw in which nothing came proves nothing"
+        assert sent, "a throw in which no item arrived proves nothing"
         assert decisions == alone, f"{kind}, seed {seed}: a decision changed"
         assert fake.events == plain.events
         assert counted == sent, f"{kind}, seed {seed}: {counted} of {sent} items were counted"

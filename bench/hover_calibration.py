@@ -1,11 +1,10 @@
-"""How well a hover's calibration knows the camera, over many draws:
-
-``python -m bench.hover_calibration --count 100``.
+"""Accuracy of a hover's camera calibration over many draws: ``python -m bench.hover_calibration
+--count 100``.
 
 Each draw hovers, sways and is calibrated as :mod:`visthrow.throws.calibrated` does it, with all the
-training's noise; then what was found is compared with what was drawn. ``--plant
-reference-realistic`` does so on the reference plant: poses with its noise, keypoints of what was
-exposed with half a pixel of noise, as the OpenCV detector has (``python -m bench.detector``)."""
+training's noise; the estimates are compared with the drawn values. ``--plant reference-realistic``
+does so on the reference plant: poses with its noise, keypoints with half a pixel of noise, as the
+OpenCV detector has (``python -m bench.detector``)."""
 
 import argparse
 from functools import partial
@@ -32,8 +31,8 @@ DRAWN = ["camera.mount.rotation_error_std=0.0524", "camera.noise.scale_std=0.03"
 TILT_DEG = 0.2
 LATENCY = 0.004
 SCALE = 0.005
-"""What is asked of tilt about each axis [deg], latency [s] and focal length [-]; of tilt on the
-reference plant half of it.
+"""Limits on the errors of tilt about each axis [deg], latency [s] and focal length [-]; the
+reference plant's tilt limit is half of it.
 """
 
 PIXEL = 0.5 / 320.0
@@ -45,8 +44,8 @@ GOAL = (2.0, 0.0, 0.0)
 def in_training(
     flown: Experiment, count: int, seed: int, device: str
 ) -> tuple[list, np.ndarray, np.ndarray]:
-    """Calibrations, or None, in the training simulator; turns [rad] and errors of the focal length
-    [-] that were drawn.
+    """Calibrations, or None, in the training simulator; the drawn turns [rad] and errors of the
+    focal length [-].
     """
     found: list = []
     torch.manual_seed(seed)

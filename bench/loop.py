@@ -1,11 +1,10 @@
 """The loop closed: an effect hidden in the reference plant, flights, diagnosis, training in the
 extended model, flights again.
 
-Every stage leaves a file in the folder of its effect and is skipped where the file is there, so a
-loop that was interrupted goes on; stages that do not need each other run side by side. Three
-policies meet on the same throws of the plant: the one that knew nothing, the one that was trained
-anew in the model extended by the diagnosis, and the oracle, trained in a model that has the hidden
-effect itself.
+Every stage writes a file into the folder of its effect and is skipped where the file exists, so an
+interrupted loop resumes; independent stages run in parallel. Three policies fly the same throws:
+the original one, one trained in the model extended by the diagnosis, and the oracle, trained in a
+model with the hidden effect.
 
     python -m bench.loop --hide motor_tau=0.02
         a slower motor; minutes on a GPU, hours on a CPU
@@ -48,14 +47,14 @@ from visthrow.throws.reference_protocol import Throwing
 from visthrow.throws.results import DIGITS
 
 PLANT = "reference"
-"""The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""
+"""The reference plant without extras: the diagnosis finds the hidden effect, or is wrong."""
 
 NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 """Of the recordings: motion capture [m], [rad], [m]."""
 
 BEFORE = 1.5
 AFTER = 0.6
-"""What is kept of a flight before the policy starts and after the landing [s]."""
+"""Times of a flight that are kept before the policy starts and after the landing [s]."""
 
 BATCH = 20
 """Throws that share a process: of 200, ten cores fly each policy's at once.
@@ -67,7 +66,7 @@ THROW_SEED = 20_000
 """Of the throws that judge; the flights that are diagnosed have the seeds from 0."""
 
 COMMITTED = Path(__file__).parent / "loops"
-"""Records of the loops that are told of."""
+"""The committed records of loops."""
 
 WHO = ("before", "after", "oracle")
 """The policies that are compared."""
@@ -75,12 +74,12 @@ WHO = ("before", "after", "oracle")
 POLICY = "policy.npz"
 CHECKPOINT = "checkpoint.pt"
 SUMMARY = "summary.json"
-"""Of a training's folder, as :mod:`visthrow.training.trainer` names them; that one is heavy to
+"""Names of files in a training's folder, as in :mod:`visthrow.training.trainer`, which is slow to
 import.
 """
 
 RECORD = "record.json"
-"""What a finished loop leaves in its folder."""
+"""File of a finished loop in its folder."""
 
 CONTRACT = ("vehicle", "rope", "release", "air", "laws", "observation.latency")
 """Parts of a policy's contract that a hidden effect breaks."""
@@ -93,7 +92,7 @@ class Loop:
     Attributes:
         hidden: effect of the catalogue -> its size.
         base: config of ``configs/train`` that the policy was trained with and that is diagnosed.
-        policy: shipped name or file of the policy that knows nothing.
+        policy: shipped name or file of the original policy.
         flights: to be diagnosed.
         throws: of each policy on the plant, in the end.
         target: of those throws, along x [m].
@@ -117,7 +116,7 @@ class Loop:
     changes: tuple[str, ...] = ()
 
     def run(self, say: Callable[[str], None]) -> dict[str, Any]:
-        """Go round, or on from where an earlier run stopped; returns the record."""
+        """Run the loop, or resume an earlier run; returns the record."""
         nominal = load_experiment(self.base)
         truth = extended(nominal, self.hidden)
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -298,7 +297,7 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
 
 
 def named(verdict: Mapping[str, Any]) -> dict[str, float]:
-    """What a verdict says to set in the model."""
+    """Sizes that a verdict sets in the model."""
     return {name: float(value) for name, value in verdict.get("theta", {}).items()}
 
 
@@ -325,7 +324,9 @@ def fly_all(
 def explained(
     logs: Sequence[Path], plant: str, answer: Path, device: str, say: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Verdict of ``visthrow diagnose explain`` on logs, run apart and kept in ``answer``."""
+    """Verdict of ``visthrow diagnose explain`` on logs, run in a separate process and written to
+    ``answer``.
+    """
     if not answer.exists():
         command = [sys.executable, "-m", "visthrow.cli", "diagnose", "explain", *map(str, logs)]
         command += ["--plant", plant, "--no-report", "--device", device, "--json", str(answer)]
@@ -339,8 +340,8 @@ def explained(
 
 
 def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> None:
-    """Fly one throw of a policy that was trained in ``base``, by its number, and keep what was
-    measured of it.
+    """Fly one throw of a policy that was trained in ``base``, by its number, and save its
+    recording.
     """
     number, path = flight
     shipped = load_policy(policy, base)
@@ -353,8 +354,8 @@ def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> Non
 
 
 def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
-    """What motion capture and the radio's log would hold of a simulated flight: noisy poses,
-    commands, the battery's voltage, nothing else true.
+    """A simulated flight as motion capture and the radio's log record it: noisy poses, commands,
+    the battery's voltage, no true states.
     """
     start = log.meta["times"]["policy_start"] - BEFORE
     end = log.meta["times"].get("landing", log.meta["times"]["end"])
@@ -379,7 +380,7 @@ def _between(channel: Channel, start: float, end: float) -> Channel:
 
 
 def hidden_text(record: Mapping[str, Any]) -> str:
-    """What was hidden from which model, in words for tables."""
+    """The hidden effects and the model, as text for tables."""
     base = record.get("base", "state")
     return ", ".join(f"{n} {v:+.4g}" for n, v in record["hidden"].items()) + (
         "" if base == "state" else f" ({base})"
@@ -431,7 +432,7 @@ def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Go round for the effects, all hidden at once, or show what was run."""
+    """Run the loop for the effects, all hidden at once, or show records."""
     if args.show is not None:
         records = read(args.show)
         print(table(records))

@@ -14,7 +14,7 @@ from visthrow.common.errors import VisthrowError
 
 TARGETS = (1.5, 2.0, 2.5)
 LIMIT_MS = 10.0
-"""What a step was to stay under, half of a control period [ms]."""
+"""Limit on the time of a step, half of a control period [ms]."""
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""MuJoCo C on the rope of a scene, as fast as it goes: what the batched simulator is timed against.
+"""MuJoCo C on the rope of a scene, at full speed: the reference for the batched simulator's timing.
 
 Contacts and constraints are off, nothing is recorded, and no Python runs within a stretch of
 ``mj_step``."""

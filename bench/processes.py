@@ -1,6 +1,4 @@
-"""Runs and fakes as processes of their own: what is measured is what is flown, the
-command itself.
-"""
+"""Runs and fakes in separate processes: the measured program is the command that flies."""
 
 import contextlib
 import json
@@ -23,7 +21,7 @@ from visthrow.common.arguments import EXIT_INTERRUPTED
 from visthrow.common.errors import VisthrowError
 
 ENDED = 120.0
-"""Most that the end of a run may take once it was told to [s]."""
+"""Longest time for a run to end after a signal [s]."""
 
 CONFIGS = {"ardupilot": "fake", "px4": "fake_px4", "betaflight": "fake_betaflight"}
 """Of a run against each kind of fake."""
@@ -36,9 +34,7 @@ _giving = threading.Lock()
 
 
 def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    """A port of this machine, UDP or TCP, that nobody listens on, and that this process was not
-    given before.
-    """
+    """A free port of this machine, UDP or TCP, that this process did not get before."""
     with _giving:
         while True:
             with socket.socket(socket.AF_INET, kind) as probe:
@@ -50,7 +46,7 @@ def free_port(kind: int = socket.SOCK_DGRAM) -> int:
 
 
 def assign_cores(jobs: int) -> list[tuple[int | None, int | None]]:
-    """Cores of run and fake for each of so many pairs at once; None where there are too few for two
+    """Assign cores to run and fake of each concurrent pair; None where there are too few for two
     each and one to spare.
     """
     usable = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -62,10 +58,9 @@ def assign_cores(jobs: int) -> list[tuple[int | None, int | None]]:
 def side_by_side(
     what: Callable[[Any, Any], Any], items: Iterable[Any], places: Sequence[Any]
 ) -> Iterator[Any]:
-    """Yield what is made of each item in a thread, as they are done; as many at once as there are
-    places, one a place.
+    """Process each item in a thread and yield results as they finish; one item at a time per place.
 
-    After an error nothing more is begun.
+    After an error no further item starts.
     """
     free = list(reversed(places))
     todo = iter(items)
@@ -89,7 +84,7 @@ class Pair:
     Attributes:
         run: further arguments of ``visthrow hil run``. fake: of ``visthrow hil fake``.
         core, fake_core: that each is kept on; None leaves it to the system.
-        orderly: Ctrl-C ends both in order, and what there is by then is returned.
+        orderly: Ctrl-C ends both in order, and the partial result is returned.
         kind: of autopilot; Betaflight's fake is there first, since it listens.
         spoiled: name and time of a fault of the fake's motion capture; see `tests.mocap_faults`.
     """
@@ -110,15 +105,14 @@ class Pair:
         Args:
             folder: of the run; not there yet.
             watch: called twice a second with the run's process id.
-            alone: the fake flies on to its end where the run has ended, or was killed, before.
+            alone: the fake continues to its end though the run has ended, or was killed, before.
 
         Returns:
             The run's summary, with whether it was ``interrupted``, empty where it was killed, and
             the fake's report.
 
         Raises:
-            VisthrowError: one of them did not start, or did not end; the message holds what it
-                said.
+            VisthrowError: one of them did not start, or did not end; the message holds its output.
         """
         port = free_port()
         msp = free_port(socket.SOCK_STREAM)
@@ -187,7 +181,7 @@ class Pair:
         runner: subprocess.Popen,
         alone: bool,
     ) -> bool:
-        """Wait for the fake's end; whether Ctrl-C brought it about."""
+        """Wait for the fake's end; returns whether Ctrl-C caused it."""
         try:
             _until(fake, watch, runner, alone)
         except KeyboardInterrupt:
@@ -220,7 +214,7 @@ class Pair:
 
 
 def _first_line(process: subprocess.Popen, expected: str) -> str:
-    """What a process says when it is ready."""
+    """The line that a process prints when it is ready."""
     line = process.stderr.readline()
     if not line.startswith(expected):
         raise VisthrowError(f"the run did not start: {line}{process.stderr.read()}")
@@ -235,7 +229,7 @@ def _until(
 ) -> None:
     while fake.poll() is None:
         gone = runner.poll() is not None
-        if gone and not alone:  # aborted, say: the fake tells what it has seen
+        if gone and not alone:  # aborted, for example: the fake writes its report
             fake.send_signal(signal.SIGINT)
             fake.wait(ENDED)
             return
@@ -248,9 +242,9 @@ def _until(
 
 
 def _end(runner: subprocess.Popen, ready_line: str, alone: bool) -> bool:
-    """The fake is gone; what is still flying is told to stop.
+    """Stop a run that still flies after its fake has ended.
 
-    Whether the run had been killed, which it may where it was left alone.
+    Returns whether the run had been killed, which is allowed with ``alone``.
     """
     if runner.poll() is None:
         runner.send_signal(signal.SIGINT)
@@ -258,12 +252,12 @@ def _end(runner: subprocess.Popen, ready_line: str, alone: bool) -> bool:
         _, text = runner.communicate(timeout=ENDED)
     except subprocess.TimeoutExpired as error:
         raise VisthrowError(
-            f"the run did not end within {ENDED:g} s after it was told to: {ready_line}"
+            f"the run did not end within {ENDED:g} s after the signal: {ready_line}"
         ) from error
     if alone and runner.returncode == -signal.SIGKILL:
         return True
-    # 1: aborted, as it was told; interrupted: it had just ended by itself as the signal came. Its
-    # summary tells the rest.
+    # 1: aborted by the signal; interrupted: it had just ended as the signal came. Its summary has
+    # the details.
     if runner.returncode not in (0, 1, EXIT_INTERRUPTED, -signal.SIGINT):
         raise VisthrowError(f"the run failed with status {runner.returncode}: {text}")
     return False
@@ -277,7 +271,7 @@ class Memory:
         self.samples: list[tuple[float, float]] = []  # [s], [bytes]
 
     def __call__(self, pid: int) -> None:
-        """Take a sample; nothing where the system does not tell."""
+        """Take a sample; none where the system does not report memory."""
         with contextlib.suppress(OSError, ValueError, IndexError):
             pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
             self.samples.append((time.monotonic(), float(pages * os.sysconf("SC_PAGE_SIZE"))))

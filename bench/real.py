@@ -1,16 +1,15 @@
-"""What the diagnosis says of recorded flights of others, of traps made of them, and what it is
-worth on flights that it never saw.
+"""Diagnoses of published recorded flights, of traps made from them, and their gain on held-out
+flights.
 
 ``python -m bench.real --data FOLDER --jobs 8 --json record.json``; ``--only NAME`` runs the
 cases whose names hold it. Three tables:
 
-- sets: each through `explain`. No KNOWN may stand where an interval of the held-out gain includes
-  0. With test flights, what the sizes that `apply` writes win back there, of what is above the
-  noise.
-- traps: flights that somebody spoilt. What is said must name what was done, or refuse with that
-  reason.
-- parts: flights of one vehicle by themselves. What one of two names must be within the other's
-  interval, both taken together with what either says that another flight may differ by.
+- - sets: each through `explain`. KNOWN requires that no interval of the held-out gain includes 0.
+  With test flights, the share of their error above the noise that the sizes written by `apply`
+  remove.
+- - traps: deliberately damaged flights. The answer must name the damage, or be an error that does.
+- - parts: separate flights of one vehicle. An effect that one of two parts names must agree with
+  the other within both intervals, widened by their spread from flight to flight.
 """
 
 import argparse
@@ -45,7 +44,7 @@ Logs = list[FlightLog]
 PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 AIRBORNE = ("quat_wb", "rate_b", "acc_b", "thrust_command")
 LATE = 0.1
-"""By which streams of a trap are late [s]."""
+"""Delay of a trap's streams [s]."""
 
 TWO_CABLES = """base = "cf_payload_pair.toml"
 [flyer]
@@ -70,7 +69,7 @@ most_windows = 24
 length = 0.5
 mass = 0.010
 """
-"""One of two vehicles on one load, as if it carried it alone."""
+"""One of two vehicles on one load, diagnosed as if it carried it alone."""
 
 EXAMPLES: dict[str, tuple[str, Callable[[Logs], NumericModel]]] = {
     "pendulum": ("pendulum_encoder", lambda logs: PendulumModel(logs, ENCODER)),
@@ -84,13 +83,13 @@ EXAMPLES: dict[str, tuple[str, Callable[[Logs], NumericModel]]] = {
 
 @dataclass(frozen=True)
 class Case:
-    """One question."""
+    """One case: logs, a setup and the expected answer."""
 
     name: str
     setup: str  # of configs/diagnose, the text of one, or one of EXAMPLES
     files: tuple[str, ...]  # below the folder of the data
     change: Callable[[Logs], Logs] = list
-    test: tuple[str, ...] = ()  # flights that nothing is estimated from
+    test: tuple[str, ...] = ()  # held-out flights
     of_test: Callable[[Logs], Logs] = list  # what of these
     expect: str = ""  # of a trap: a regular expression that its answer must match
     of: str = ""  # of a part: the vehicle
@@ -99,7 +98,7 @@ class Case:
 def changed(
     names: Sequence[str], change: Callable[[np.ndarray], np.ndarray]
 ) -> Callable[[Logs], Logs]:
-    """Other values of some channels in all logs."""
+    """Return a change of some channels' values in all logs."""
 
     def one(log: FlightLog) -> FlightLog:
         chosen = {n: c for n, c in log.channels.items() if n in names}
@@ -115,7 +114,7 @@ def changed(
 
 
 def late(names: Sequence[str], by: float = LATE) -> Callable[[Logs], Logs]:
-    """Some channels' stamps later in all logs."""
+    """Return a change that delays some channels' stamps in all logs."""
     return lambda logs: [
         FlightLog(
             {n: replace(c, time=c.time + by) if n in names else c for n, c in log.channels.items()},
@@ -126,7 +125,7 @@ def late(names: Sequence[str], by: float = LATE) -> Callable[[Logs], Logs]:
 
 
 def first(change: Callable[[Logs], Logs]) -> Callable[[Logs], Logs]:
-    """A change of the first log alone."""
+    """Return a change of the first log alone."""
     return lambda logs: [*change(logs[:1]), *logs[1:]]
 
 
@@ -184,7 +183,7 @@ def dead_rotor(logs: Logs) -> Logs:
 
 
 def winds(_: Logs) -> Logs:
-    """Six simulated flights in winds of three strengths: no recorded set has any."""
+    """Six simulated flights in three wind speeds: no recorded set has wind."""
     from bench.diagnose.flown import fly
 
     return [fly(8.0, drag=0.03, wind=wind, seed=i) for i, wind in enumerate((-2.0, 0.5, 3.0) * 2)]
@@ -469,7 +468,7 @@ def _read(files: Sequence[str], data: Path, setup: str) -> Logs:
 
 
 def run(task: tuple[Case, Path]) -> dict:
-    """Answer of a case as plain data."""
+    """Diagnose a case; returns its row as plain data."""
     case, data = task
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     with tempfile.TemporaryDirectory() as folder:
@@ -479,7 +478,7 @@ def run(task: tuple[Case, Path]) -> dict:
         try:
             diagnosis = diagnose(logs, model_of(logs), vehicle=known)
             text = report.summary(diagnosis)
-        except Exception as error:  # what a user would be told
+        except Exception as error:  # the user's error message
             text = f"error: {error}\n" + "\n".join(
                 f"{r.topic} {r.channel}: {r.text}"
                 for c in check(logs, known)
@@ -519,7 +518,7 @@ def run(task: tuple[Case, Path]) -> dict:
 def _unseen(
     diagnosis: result.Diagnosis, plain: NumericModel, extended: NumericModel
 ) -> dict[str, list[float]]:
-    """Return errors on other flights of the plain model and of one with the sizes that `apply`
+    """Return errors on held-out flights of the plain model and of one with the sizes that `apply`
     writes, and of noise alone.
     """
     extended.extend(SavedDiagnosis(report.to_json(diagnosis), "the diagnosis").sizes[0])
@@ -528,16 +527,16 @@ def _unseen(
 
 
 def won_back(errors: Sequence[float]) -> float:
-    """Share of what is above the noise."""
+    """Share of the error above the noise that is removed."""
     before, after, floor = errors
     return (before - after) / (before - floor)
 
 
 def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
-    """Of pairs of parts of one vehicle and each name of either: whether both tell one size, within
-    both intervals taken together.
+    """For each pair of one vehicle's parts and each name of either: whether their sizes agree
+    within the sum of both intervals.
 
-    Of a class it is said that one of its members is the cause: it agrees where one of them does.
+    A class agrees where one of its members does.
     """
     found = []
     for a, b in combinations(rows, 2):
@@ -559,8 +558,8 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
 
 
 def _one_size(a: Sequence, b: Sequence) -> bool:
-    """Whether two findings may be of one size: within their intervals, and what either says that
-    another flight may differ by.
+    """Whether two findings may have one size: within their intervals, widened by their spread from
+    flight to flight.
     """
     apart = abs(a[1] + a[2] - b[1] - b[2]) / 2.0
     half_widths = [(f[2] - f[1]) / 2.0 for f in (a, b)]
@@ -569,7 +568,7 @@ def _one_size(a: Sequence, b: Sequence) -> bool:
 
 
 def table(rows: Sequence[dict]) -> str:
-    """Print what came."""
+    """Print the results."""
     lines = []
     for row in sorted(rows, key=lambda row: row["case"]):
         gains = "; ".join(
@@ -599,7 +598,7 @@ def table(rows: Sequence[dict]) -> str:
     )
     traps = [row for row in rows if "ok" in row]
     lines.append(
-        f"traps: {sum(row['ok'] for row in traps)} of {len(traps)} told with the right reason"
+        f"traps: {sum(row['ok'] for row in traps)} of {len(traps)} answered with the right reason"
     )
     pairs = agreement([row for row in rows if row.get("of")])
     lines.append(
@@ -631,7 +630,7 @@ def main() -> None:
 
 
 def _run_index(task: tuple[str, Path]) -> dict:
-    """A case by its name: functions do not travel to other processes."""
+    """A case by its name: functions cannot be sent to other processes."""
     name, data = task
     return run((next(case for case in (*SETS, *TRAPS, *PARTS) if case.name == name), data))
 

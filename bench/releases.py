@@ -1,8 +1,8 @@
-"""How policies let go: ball and vehicle at the separation and the cable's shape, where they were
-trained and on the full plant.
+"""Release states of policies: ball and vehicle at the separation and the cable's shape, on the
+training's plant and on the full one.
 
-Tells why a component of the simulator matters or does not: a policy trained without it reaches
-another release state on the full plant, or the same.
+Shows whether a component of the simulator matters: a policy trained without it reaches another
+release state on the full plant, or the same one.
 
     python -m bench.releases paper --units state-1,state_rigid_cable-1    at 2 m
 """
@@ -102,7 +102,7 @@ class _Watched(ThrowEnv):
 
 
 def releases(loaded: Loaded, target: float, count: int, device: str, seed: int = 0) -> Releases:
-    """Throw in the training simulator and keep how the policy lets go.
+    """Throw in the training simulator and keep the release states.
 
     Args:
         loaded: policy and the experiment that it is flown in.

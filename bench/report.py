@@ -43,7 +43,7 @@ class Report:
     bench: str  # which module of this folder made it
     title: str
     tables: tuple[Table, ...]
-    # sentences below the tables: how it was measured, what a number does not say
+    # sentences below the tables: how it was measured, limits of the numbers
     notes: tuple[str, ...]
     # the numbers behind the tables, SI units, for programs
     figures: dict[str, Any] = field(default_factory=dict)
@@ -65,7 +65,7 @@ def rate(per_second: float) -> str:
 
 
 def finish(report: Report, args: argparse.Namespace) -> int:
-    """Print a report and write it where ``--json`` and ``--record`` say."""
+    """Print a report and write it to ``--json`` and ``--record``."""
     path = record_path(args.record) if args.record else None
     print(measurements.body(asdict(report)))
     for target in (args.json, path):

@@ -1,8 +1,8 @@
 """The HIL runner against the fake autopilot, each in its own process, over loopback in real time.
 
 Latency and soak by default: times of each stage, ticks missed, memory. With ``--throws`` a series
-of throws, each paired with the same one flown without a wire. With ``--faults`` what the runner
-does when something fails, and after how long."""
+of throws, each paired with the same one flown without a wire. With ``--faults`` its reactions to
+faults, and their delays."""
 
 import argparse
 import sys
@@ -16,7 +16,7 @@ from bench.throws import series
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure what was asked for."""
+    """Run the chosen measurement."""
     measure = series if args.throws else soak if args.faults is None else faults
     return finish(measure(args), args)
 

@@ -1,5 +1,5 @@
-"""How landings change with what the paper leaves open, and the size of each effect of the catalogue
-at which they miss by the paper's 0.10 m.
+"""Sensitivity of landings to numbers that the paper does not state, and the size of each catalogue
+effect at which the error reaches the paper's 0.10 m.
 
     python -m bench.sensitivity state vision --out out/sensitivity --record sensitivity
 
@@ -52,7 +52,7 @@ BLOCKS = ("sensing", "integrator")
 FIRST = 0.5
 GROWTH = 2.0
 LAST = 64.0
-"""Sizes that are tried: from, by and up to so many prior deviations."""
+"""Sizes that are flown, in prior deviations: first, step and last."""
 
 Point = dict[str, Any]
 
@@ -108,7 +108,7 @@ def crossing(points: Sequence[tuple[float, float]]) -> float | None:
 
 
 class Points:
-    """Points that were thrown, kept line by line."""
+    """Flown points, appended to a file line by line."""
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -117,7 +117,7 @@ class Points:
         self.kept = {tuple(row["key"]): row for row in map(json.loads, lines)}
 
     def get(self, key: tuple[str, str, float], throw: Callable[[], dict[str, float]]) -> Point:
-        """Return the point of this key, thrown now unless it is there."""
+        """Return the point of this key; throws it unless it is in the file."""
         if key not in self.kept:
             status(f"{key[0]}: {key[1]} {key[2]:+.4g}")
             self.kept[key] = {"key": list(key), **throw()}

@@ -16,26 +16,26 @@ from bench.report import Report, Table
 from visthrow.common.errors import VisthrowError
 
 STILL = ("--plant", "tests.level:make")
-"""A vehicle without a simulator: it takes no time from the runner."""
+"""A vehicle without a simulator, which takes no time from the runner."""
 
 P50 = 1.2
 P99 = 2.2
-"""Bars of the whole way from the look for messages to the command's bytes [ms]."""
+"""Limits on the time from reading messages to the command's bytes [ms]."""
 
 WARM = 0.2
 """Share of a soak before memory is looked at: buffers fill, pages are touched."""
 
 TELL = 30.0
-"""Between two words on how far a soak has come [s]."""
+"""Time between two progress messages [s]."""
 
 TIMES = ("p50_ms", "p95_ms", "p99_ms", "max_ms")
 
 
 class Progress(Memory):
-    """Memory over time, said and kept in a file on the way."""
+    """Memory over time, printed and appended to a file during the soak."""
 
     def __init__(self, path: Path, minutes: float) -> None:
-        """Begin the file; ``minutes`` are what is to come."""
+        """Begin the file; ``minutes``: length of the soak."""
         super().__init__()
         self._path = path
         self._minutes = minutes
@@ -66,8 +66,8 @@ class Progress(Memory):
 
 
 def soak(args: argparse.Namespace) -> Report:
-    """Latency, misses and memory of a throw that lasts; Ctrl-C ends it early, and what there is by
-    then is told.
+    """Latency, misses and memory of a long throw; Ctrl-C ends it early with a report of the time so
+    far.
 
     Raises:
         VisthrowError: a time or rate out of range.
@@ -111,8 +111,7 @@ def _another(core: int | None) -> int | None:
 
 
 def never_releasing(name: str, path: Path) -> Path:
-    """Write a policy that is another one in all but its release, which it never asks for: a throw
-    that lasts.
+    """Write a copy of a policy that never releases, for a throw that does not end.
 
     Args:
         name: of a shipped policy, or a file. path: to write.

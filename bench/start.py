@@ -1,4 +1,4 @@
-"""What the commands of this folder share: options, how mistakes are told, the exit status."""
+"""Parts that the commands of this folder share: options, error messages, exit status."""
 
 import argparse
 import sys
@@ -12,7 +12,7 @@ Run = Callable[[argparse.Namespace], Any]
 
 
 def parser_of(about: str | None, record: bool = True) -> argparse.ArgumentParser:
-    """A parser that shows a module's docstring; with the options of what is kept as a record."""
+    """A parser that shows a module's docstring, with the options of a record."""
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter
     )

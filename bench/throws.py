@@ -22,13 +22,13 @@ RATIO = 1.3
 """Bars: mean landing error [m]; the 90 % upper bound of the ratio of mean errors."""
 
 AFTER = 1.0
-"""The fake flies on so long after the landing, so that the runner sees the ball come down [s]."""
+"""Time that the fake flies on after the landing, so that the runner measures it [s]."""
 
 PART = 5
 """Throws without a wire that one process flies; they are kept when it is done."""
 
 LONGEST = 30.0
-"""A throw over the wire that has not landed by then is none [s]."""
+"""Time limit of a throw over the wire; later landings do not count [s]."""
 
 
 def series(args: argparse.Namespace) -> Report:

@@ -24,7 +24,7 @@ def train(
     every: int | None = None,
     whole: bool = False,
 ) -> dict[str, Any]:
-    """Train until throws land within the smallest error for good, or the time is up; throw every so
+    """Train until throws stay within the smallest error, or the time is over; evaluate every so
     many iterations, or by the clock.
 
     Args:

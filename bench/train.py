@@ -1,4 +1,4 @@
-"""Where the wall time of a training goes: in an iteration, or to an error over seeds.
+"""Wall time of a training: by parts of an iteration, or to an error over seeds.
 
 python -m bench.train state --device cuda
     simulation, environment, inference and learning

@@ -1,7 +1,7 @@
-"""What a vision policy needs beside keypoints: trainings over fresh seeds, thrown with and without
-faults.
+"""Inputs that a vision policy needs beside keypoints: trainings over fresh seeds, thrown with and
+without faults.
 
-Each variant changes what ``vision`` is given or how it remembers; nothing else differs.
+Each variant changes the inputs of ``vision`` or its memory; nothing else differs.
 
     python -m bench.vision_ablation OUT --work runs/ablation    # goes on where it stopped
 
@@ -46,7 +46,7 @@ LIMIT = 230.0
 """Longest that a training takes unless stated otherwise [s]; a longer schedule is shortened."""
 LEAST = 45.0
 RESERVE = 15.0
-"""Time that a training must have to be begun, and what is kept for its throws [s]."""
+"""Least remaining time to start a training, and the time reserved for its throws [s]."""
 
 
 def trained(trainer: Any, seconds: float) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
 
 
 def job(args: argparse.Namespace) -> int:
-    """Train one variant with one seed, throw, and write what came of it."""
+    """Train one variant with one seed, throw, and write the results."""
     from visthrow.task import load_experiment
     from visthrow.training.trainer import Trainer, finish
 
@@ -106,7 +106,7 @@ def job(args: argparse.Namespace) -> int:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all trainings, several on each device, and pack what came of them."""
+    """Run all trainings, several on each device, and pack the results."""
     if args.job:
         return job(args)
     work = Path(args.work)

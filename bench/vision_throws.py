@@ -42,7 +42,7 @@ FAULTS = {
     "40 ms late": ("task.observation.latency=[0.04,0.04]",),
     "2 % wrong": ("camera.noise.wrong_probability=0.02",),
 }
-"""One thing wrong with the camera -> the override that makes it so."""
+"""Fault of the camera -> the override that causes it."""
 
 
 def noise(factor: float, layout: str) -> tuple[str, ...]:

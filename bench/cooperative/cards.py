@@ -18,9 +18,9 @@ from pathlib import Path
 from bench import start
 
 THROWING = 60.0  # time kept for the throws after a training [s]
-KEEPING = 45.0  # between two policies that are kept on the way [s]
+KEEPING = 45.0  # between two saved policies [s]
 TALKING = 10.0  # between two lines of progress [s]
-EARLY = 150.0  # a job that fails by then is begun again without CUDA graphs [s]
+EARLY = 150.0  # a job that fails earlier is restarted without CUDA graphs [s]
 THROWS = 200
 SEED = 900_000  # of the throws: no training has it
 

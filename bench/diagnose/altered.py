@@ -1,6 +1,4 @@
-"""Logs of the same flights told otherwise: turned, seen in a mirror, at other times, in another
-order, mixed up.
-"""
+"""Transformed logs of the same flights: turned, mirrored, shifted in time, reordered, mixed up."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -59,8 +57,8 @@ def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
 
 
 def mirrored(log: FlightLog) -> FlightLog:
-    """The same flight seen in a mirror between left and right: y of places turns, and turns about x
-    and z.
+    """The same flight mirrored left to right: y of positions changes sign, and so do rotations
+    about x and z.
     """
     place = lambda p: p * [1.0, -1.0, 1.0]  # noqa: E731
     changes = {
@@ -72,7 +70,7 @@ def mirrored(log: FlightLog) -> FlightLog:
 
 
 def mirrored_theta(theta: dict[str, float]) -> dict[str, float]:
-    """What a diagnosis of mirrored flights must say."""
+    """The expected diagnosis of mirrored flights."""
     return {
         MIRRORED.get(name, name): -size if name in NEGATED else size for name, size in theta.items()
     }
@@ -99,8 +97,8 @@ def scrambled(logs: Sequence[FlightLog]) -> list[FlightLog]:
 
 
 class Flipped(Model):
-    """A model whose residuals have another sign in every other flight: noise as before, but no
-    cause in common.
+    """A model whose residuals change sign in every other flight: the noise stays, a common cause
+    does not.
     """
 
     def __init__(self, model, seed: int) -> None:

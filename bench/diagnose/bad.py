@@ -76,7 +76,7 @@ def frozen(log: FlightLog) -> FlightLog:
 
 
 def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
-    """A vehicle that does not move, for so long: noise about one place, one command."""
+    """A vehicle at rest for a given time: noise about one position, one command."""
     rng = np.random.default_rng(1)
     t = np.arange(0.0, seconds, 1.0 / rate)
     sent = np.arange(0.0, seconds, 0.02)
@@ -94,8 +94,8 @@ def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> 
 
 
 def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
-    """A hover that is never quite still, for so long: paths, attitudes and commands of a vehicle
-    whose blades do not flap, whose rates follow at once, and whose battery never drains.
+    """A slowly wandering hover of given length: paths, attitudes and commands of a vehicle without
+    blade flapping, rate lag or battery drain.
     """
     rng = np.random.default_rng(1)
     t = np.arange(0.0, seconds, 1.0 / rate)
@@ -152,7 +152,7 @@ class Bad:
     right: Mapping[str, float] = field(default_factory=dict)  # signs of effects that the logs have
 
     def run(self, recipe: Recipe, folder: Path) -> dict:
-        """Fly a world without effect, spoil its logs, ask."""
+        """Fly a world without effect, damage its logs, diagnose them."""
         logs = self.spoil(logs_of(recipe) if self.flown else [])
         place = Path(tempfile.mkdtemp(dir=folder))
         for i, log in enumerate(logs):
@@ -182,8 +182,8 @@ class Bad:
 
 
 def fair(done: subprocess.CompletedProcess, verdict: dict, right: Mapping[str, float]) -> bool:
-    """No traceback, no name or sign that is not right; and either a verdict or an error of one
-    sentence.
+    """Whether there is no traceback and no wrong name or sign, and either a verdict or an error of
+    one sentence.
     """
     theta = verdict.get("theta") or {}
     wrong = [name for name, size in theta.items() if right.get(name, 0.0) * size <= 0.0]

@@ -1,9 +1,9 @@
 """The diagnosis beside ``aeroid`` (PyPI, MIT), an output-error estimator for parameters that its
 user names.
 
-Both get the same throws of a ball under motion capture and the same names: drag and wind. Then the
-names are taken away, which leaves the diagnosis alone. Worlds come from scipy's integrator; noise
-is white, or correlated over 30 ms as a tracker's filter leaves it.
+Both get the same throws of a ball under motion capture and the same names: drag and wind. Then only
+the diagnosis runs, without the names. Worlds come from scipy's integrator; noise is white, or
+correlated over 30 ms as a tracker's filter leaves it.
 
     pip install -c constraints.txt "visthrow[beside]"
     python -m bench.diagnose.beside_aeroid 10 --out bench/diagnose/beside-aeroid.json
@@ -66,7 +66,7 @@ def slope(state: np.ndarray, size: dict[str, float]) -> np.ndarray:
 
 
 def by_aeroid(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Estimates and standard errors; what each throw began with is estimated beside the
+    """Estimates and standard errors; initial states of the throws are estimated with the
     parameters.
     """
     import aeroid
@@ -107,7 +107,7 @@ def model_of(stamps: np.ndarray, positions: np.ndarray) -> BallModel:
 
 
 def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
-    """The same of the diagnosis' estimator, whose names are given."""
+    """Estimates of the diagnosis' estimator, with the same parameter names."""
     found = fitting.fit(model_of(stamps, positions), NAMES)
     return {
         name: (float(found.theta[i]), float(np.sqrt(found.covariance[i, i])))
@@ -116,9 +116,7 @@ def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, 
 
 
 def compared(seed: int, colour: str) -> dict:
-    """One world: errors and standard errors of both, seconds, and what the diagnosis says without
-    names.
-    """
+    """One world: errors and standard errors of both, seconds, and the diagnosis without names."""
     truth, stamps, paths = world(seed)
     rng = np.random.default_rng([seed, 1])
     positions = paths + SIGMA * np.array([sensor_noise(rng, colour, path.shape) for path in paths])

@@ -4,8 +4,8 @@ the model altered.
     python -m bench.diagnose.cases mirror=10 swap=10 idempotence=10 scramble=10 --jobs 8 --ledger
     cases.jsonl
 
-Each case is a world of its own, on a plant that shares no code with the package; the tool runs
-apart, as in :mod:`bench.diagnose.sealed`."""
+Each case has its own world, on a plant that shares no code with the package; the tool runs in a
+separate process, as in :mod:`bench.diagnose.sealed`."""
 
 import argparse
 import json
@@ -32,12 +32,12 @@ from visthrow.logs.flightlog import FlightLog
 SIZE = dict(free=4, free_seconds=6.0, throws=6)
 """Flights of a case: fewer than those of the bank, since each is explained twice."""
 NEAR = 4.0
-"""Deviations within which two answers to one question must lie."""
+"""Deviations within which two estimates of one size must agree."""
 BASE = "train/state.toml"
 
 
 def environment() -> dict[str, str]:
-    """Of a process that finds the package wherever it runs."""
+    """Environment of a process that finds the package from any folder."""
     root = Path(__file__).resolve().parents[2]
     return os.environ | {
         "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])
@@ -47,9 +47,7 @@ def environment() -> dict[str, str]:
 def command_for(
     count: int, recipe: Recipe, action: str = "explain", plant: str | None = None
 ) -> list[str]:
-    """Arguments that ask about so many logs of a folder, with the model that is the
-    world's null.
-    """
+    """Arguments of the command for a number of logs in a folder, with the world's null model."""
     command = [
         "diagnose",
         action,
@@ -71,7 +69,8 @@ def command_for(
 
 
 def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
-    """Run ``visthrow`` apart, in a folder, without access to the tests; its output.
+    """Run ``visthrow`` in a separate process, in a folder, without access to the tests; returns its
+    output.
 
     Raises:
         RuntimeError: It failed.
@@ -125,8 +124,8 @@ def names(verdict: dict) -> set[str]:
 
 
 def is_right(verdict: dict, name: str) -> bool:
-    """One cause named: this one, alone or in a class that holds it, or one that flights of this
-    kind hardly tell from it.
+    """Whether one cause is named: this one, alone or in a class that holds it, or one that such
+    flights hardly distinguish from it.
     """
     groups = named_by(verdict)
     near = {name}.union(*(a for a in ALIKE if name in a))
@@ -144,7 +143,7 @@ def size_is(verdict: dict, name: str, size: float) -> bool:
 
 
 def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: theta) -> bool:
-    """Whether two verdicts name the same effects with the same sizes, and say the same overall."""
+    """Whether two verdicts agree on effects, sizes and the overall verdict."""
     expected = sizes(one.get("theta") or {})
     came = other.get("theta") or {}
     sd = {f["name"]: max(f["sd"], f["floor"]) for f in other["findings"]}
@@ -181,7 +180,9 @@ def _bare(recipe: Recipe) -> Recipe:
 
 
 def mirror(recipe: Recipe, folder: Path) -> dict:
-    """The world is nominal and the model has what the recipe says: the opposite correction."""
+    """A nominal world and a model with the recipe's effects: the diagnosis must find the opposite
+    correction.
+    """
     name, size = hidden(recipe)
     verdict = explained(
         folder, logs_of(_bare(recipe)), recipe, configured(recipe.effects, folder / "model.toml")
@@ -190,7 +191,7 @@ def mirror(recipe: Recipe, folder: Path) -> dict:
 
 
 def swap(recipe: Recipe, folder: Path) -> dict:
-    """The effect is in both: nothing to be found."""
+    """The effect is in world and model: nothing may be found."""
     verdict = explained(
         folder, logs_of(recipe), recipe, configured(recipe.effects, folder / "model.toml")
     )
@@ -198,7 +199,7 @@ def swap(recipe: Recipe, folder: Path) -> dict:
 
 
 def idempotence(recipe: Recipe, folder: Path) -> dict:
-    """Found, put into the configuration by ``apply``, and not found again."""
+    """An effect that ``apply`` writes into the configuration must not be found again."""
     logs = logs_of(recipe)
     first = explained(folder, logs, recipe)
     (folder / "first.json").write_text(json.dumps(first))
@@ -214,7 +215,7 @@ def idempotence(recipe: Recipe, folder: Path) -> dict:
 
 
 def scramble(recipe: Recipe, folder: Path) -> dict:
-    """Commands of one flight with poses of another: no name."""
+    """Commands of one flight with poses of another: nothing may be named."""
     verdict = explained(folder, altered.scrambled(logs_of(recipe)), recipe)
     return {
         "passed": (
@@ -225,7 +226,7 @@ def scramble(recipe: Recipe, folder: Path) -> dict:
 
 
 def flip(recipe: Recipe, _: Path) -> dict:
-    """Residuals of every other flight turned around: what is common to all flights is gone."""
+    """Residuals of every other flight with the opposite sign: no common cause remains."""
     from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.select import diagnose_flights
     from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -248,12 +249,12 @@ def _twice(
     second = explained(folder, change(logs), recipe)
     found = any(
         is_right(first, name) for name in recipe.effects
-    )  # what is missed here must be missed alike
+    )  # an effect missed here must be missed in the transformed logs, too
     return {"passed": same(first, second, sizes), "found": found, "said": second, "before": first}
 
 
 def turn(recipe: Recipe, folder: Path) -> dict:
-    """Hall turned by a quarter and moved: the wind turns along, all else stays."""
+    """The hall's axes turned by 90 deg and moved: wind turns with them, other sizes stay."""
 
     def sizes(theta):
         quarter = {"wind_x": ("wind_y", 1.0), "wind_y": ("wind_x", -1.0)}
@@ -274,7 +275,7 @@ def turn(recipe: Recipe, folder: Path) -> dict:
 
 
 def leftright(recipe: Recipe, folder: Path) -> dict:
-    """The flights seen in a mirror: the verdict seen in a mirror."""
+    """Mirrored flights must give the mirrored verdict."""
     return _twice(
         recipe, folder, lambda logs: [altered.mirrored(log) for log in logs], altered.mirrored_theta
     )
@@ -325,8 +326,8 @@ class Task:
 
 
 def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
-    """World of a case: an effect and a plant from a seed; nothing where logs are spoiled, in a pair
-    what belongs to it.
+    """World of a case: an effect and a plant from a seed; no effect where logs are damaged, the
+    pair's effect in a pair.
     """
     from bench.diagnose.bad import BAD
     from bench.diagnose.degenerate import PAIRS
@@ -350,7 +351,7 @@ def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
 
 
 def brief(verdict: dict) -> dict:
-    """What a ledger keeps of a verdict."""
+    """The part of a verdict that the ledger keeps."""
     found = [f for f in verdict["findings"] if f["verdict"] in ("FOUND", "CLASS")]
     keep = ("name", "verdict", "estimate", "sd", "partners")
     return {
@@ -386,7 +387,7 @@ def run_kind(kind: str) -> Callable[[Recipe, Path], dict]:
 
 
 def main() -> None:
-    """Run cases and add them to a ledger; cases that are there are not run again."""
+    """Run cases and append them to a ledger; cases in the ledger are skipped."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("cases", nargs="+", metavar="KIND=COUNT", help=f"of {', '.join(KINDS)}")
     parser.add_argument(

@@ -3,8 +3,8 @@
     python -m bench.diagnose.constants answer --jobs 32 --ledger fix.jsonl
     python -m bench.diagnose.constants compare fix.jsonl
 
-An answer that depends on a constant would differ between the two values on either side of it. The
-other half, ``bank-confirm.txt``, is for the values that were chosen.
+An answer that depends on a constant differs between the two values on either side of it. The other
+half, ``bank-confirm.txt``, tests the chosen values.
 """
 
 import argparse
@@ -28,7 +28,7 @@ VALUES = {
     "UNKNOWN_RATIO = 3.0": (2.5, 4.0),
     "LOST_SHARE = 0.15": (0.1, 0.25),
 }
-"""Statements of ``evidence``, and the values that take the place of theirs."""
+"""Statements of ``evidence``, and replacement values."""
 LAST = 60.0  # no world begins in the last seconds
 
 

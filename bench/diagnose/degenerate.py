@@ -1,8 +1,8 @@
-"""Flights that cannot tell two causes apart, made on purpose; what the tool then asks for is done,
+"""Flights that cannot distinguish two causes; the tool's proposals are then flown or measured,
 until one cause is named.
 
-Kinds of :mod:`bench.diagnose.cases`: the manoeuvre that ``visthrow diagnose plan`` proposes is
-flown on the independent plant, a measurement that it proposes is made there."""
+Kinds of :mod:`bench.diagnose.cases`: manoeuvres that ``visthrow diagnose plan`` proposes are flown
+on the independent plant, proposed measurements are made there."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +45,7 @@ class Pair:
     signs: tuple[float, ...] = (-1.0, 1.0)
 
     def run(self, recipe: Recipe, folder: Path) -> dict:
-        """Fly, ask, do as told, ask again."""
+        """Fly, plan, follow the proposals, diagnose again."""
         tables = [
             table_of(manoeuvre_of(name).csv(), self.payload)
             for name in self.flights
@@ -81,7 +81,7 @@ class Pair:
     def flown(
         self, recipe: Recipe, answer: dict, proposal: dict, payload: bool, number: int
     ) -> list[FlightLog]:
-        """Fly a proposal on the plant as often as it asks, within reason."""
+        """Fly a proposal on the plant as often as it states, up to a limit."""
         table = table_of(answer["tables"][proposal["reference"]], payload)
         times = min(max(proposal["repeats"], 1), MOST_FLIGHTS)
         return [
@@ -92,11 +92,11 @@ class Pair:
         ]
 
     def named(self, answer: dict) -> bool:
-        """Whether it is named, alone."""
+        """Whether the effect alone is named."""
         return named_by(answer) == [{self.effect}]
 
     def admits_ambiguity(self, answer: dict) -> bool:
-        """Whether the first answer says that these flights cannot tell."""
+        """Whether the first answer reports that these flights cannot distinguish the causes."""
         if not self.alike:
             return (
                 next(f["verdict"] for f in answer["findings"] if f["name"] == self.effect)
@@ -105,7 +105,7 @@ class Pair:
         return any(self.effect in group and group & self.alike for group in named_by(answer))
 
     def line(self, first: dict, last: dict, done: list, named: bool) -> dict:
-        """What the ledger keeps."""
+        """The ledger's line."""
         return {
             "passed": self.admits_ambiguity(first) and named,
             "told": self.admits_ambiguity(first),
@@ -119,22 +119,21 @@ class Pair:
 DEGREE = 0.0175
 """One prior deviation of a tilt, as 0.5 m/s is of the wind [rad].
 
-Two short hovers in gusts tell a tilt to 2 mrad. Of 8 mrad they hold 4 nats at the best size of any
-one cause, and 3 for wind, frame, markers and drag together, where a cause needs 7: then "no effect;
-if present at all, between 2 and 10 mrad" is the right answer, and there is no class to be
-reported."""
+Two short hovers in gusts measure a tilt to 2 mrad. At 8 mrad they hold 4 nats for the best single
+cause, and 3 for wind, frame, markers and drag together; a cause needs 7. Then "no effect; if
+present at all, between 2 and 10 mrad" is the right answer, without a class."""
 LATE = (1.0,)
 """The only sign in which a delay of commands and one of stamps are a pair: nothing is measured
 before it happens, so that commands that act sooner have no partner.
 """
 MILLIMETRES = 3e-3
 GRAMS = 4e-3
-"""Sizes that two short hovers hardly tell from other causes, up to 3 nats apart where the cause
-itself has 10 to 15.
+"""Sizes that two short hovers hardly distinguish from other causes: up to 3 nats apart, where the
+cause itself has 10 to 15.
 
-More than that they tell at once, for gusts make the payload swing: 8 mm of rope stand out from 8 mm
-of a marker by 2 to 4 nats on a string and by 13 on a rod, 6 g of payload by 2 to 4 nats from what
-lifts or weighs as much."""
+Larger sizes are distinguished, since gusts make the payload swing: 8 mm of rope differ from 8 mm of
+a marker by 2 to 4 nats on a string and by 13 on a rod, 6 g of payload by 2 to 4 nats from equal
+lift or weight."""
 HOVER = ("hover",)
 BARE = ("hover without payload",)
 DOUBLETS = ("rate doublets",)
@@ -164,6 +163,6 @@ PAIRS = {
     "ball_at_rest": Pair("payload_drag", 2e-3, frozenset(), HOVER, True, (1.0,)),
     "lift_at_rest": Pair("translational_lift", 5e-3, frozenset(), HOVER, True),
 }
-"""The degenerate pairs of the design that flights alone can show, and effects that hover does not
+"""The design's degenerate pairs that flights alone can separate, and effects that hover does not
 excite.
 """

@@ -1,13 +1,12 @@
-"""Tests that require finding: small sealed worlds, one judge for every tool, and tools spoilt on
-purpose that it must catch.
+"""Small sealed worlds that a tool must diagnose, one judge for every tool, and spoilt tools that
+the judge must reject.
 
 A kind of world hides one effect, two, a law that the catalogue does not hold, or nothing. Its world
 is drawn from a seed of the system, flown by a plant that shares no code with the package, and
-handed over as files that are named after an effect which is *not* hidden. A tool is a function of
-that folder and of the arguments that state the model; what it returns is the JSON of ``visthrow
-diagnose explain``. A tool that is wrong about a kind is asked about a second world of it: at 99
-right answers of a hundred the tool itself is wrong twice about one of a dozen kinds in one run of
-eight hundred.
+handed over as files named after an effect that is *not* hidden. A tool is a function of that folder
+and of the arguments that state the model; it returns the JSON of ``visthrow diagnose explain``. A
+tool that is wrong about a kind gets a second world of it: at 99 % right answers it fails twice on
+one of a dozen kinds in one run of eight hundred.
 
     python -m bench.diagnose.finding 20          # share of right answers at the first attempt, in
     twenty suites
@@ -36,14 +35,14 @@ Tool = Callable[[Path, list[str]], dict]
 """Folder of logs, overrides that state the model -> verdict, as ``explain --json`` writes it."""
 
 SMALL = dict(free=2, free_seconds=2.0, throws=4)
-"""Flights of a world: the tool is done with one in three to ten seconds."""
+"""Flights of a world: the tool takes three to ten seconds for one."""
 SIZE = 25.0
 """Of a hidden effect [floors].
 
-At this size the tool was right about 131 of 132 worlds of twelve suites at the first attempt.
+At this size the tool answered 131 of 132 worlds of twelve suites right at the first attempt.
 """
 LAW_SIZE = 2.0
-"""Of a law, in the size that shows in the banks' longer flights."""
+"""Of a law, relative to the size found in the banks' longer flights."""
 SINGLE = (
     "com_x",
     "com_y",
@@ -76,10 +75,10 @@ PAIRED = (
     "mass_payload",
 )
 LOST = 0.08
-"""Share of lost commands: told in 32 of 34 such worlds.
+"""Share of lost commands: reported in 32 of 34 such worlds.
 
-Of 0.15 it was told alone in 20 of 23, for flights seem to differ besides; of 0.05 in 14 of 20. At
-32 of 34 the tool is wrong twice in one run of three hundred.
+A share of 0.15 was reported alone in 20 of 23, since other effects then seem to vary by flight;
+0.05 in 14 of 20. At 32 of 34 the tool fails twice in one run of three hundred.
 """
 UNKNOWN_LAWS = ("law_ball_swirl", "law_vehicle_swirl", "law_speed_thrust")
 
@@ -134,10 +133,10 @@ def draw_few(rng: np.random.Generator) -> list[Kind]:
 
 
 def right(recipe: Recipe, verdict: dict) -> bool:
-    """The hidden effects up to class with their sizes, and no other; of a law its term and no name;
-    of nothing NO EFFECT.
+    """Whether a verdict names the hidden effects, up to class, with their sizes, and no other; for
+    a law its term and no name; without effect NO EFFECT.
 
-    Lost commands are told, and named for nothing else.
+    Lost commands are reported, and nothing is named.
     """
     judgement = judge(recipe, verdict)
     laws = [name for name in recipe.effects if name in LAWS]
@@ -160,7 +159,7 @@ def right(recipe: Recipe, verdict: dict) -> bool:
 
 
 _FLOWN: dict[str, list[bytes]] = {}
-"""Digest of a recipe -> the files of its flights: tools are asked about the same worlds."""
+"""Digest of a recipe -> the files of its flights: all tools get the same worlds."""
 
 
 def ask(tool: Tool, recipe: Recipe) -> dict:
@@ -205,7 +204,7 @@ def require(tool: Tool, chosen: list[Kind], seed: int) -> None:
 
 
 def explain(folder: Path, model: list[str]) -> dict:
-    """The tool itself, through the door that its users take."""
+    """The tool itself, through its command line."""
     from visthrow.cli import main as visthrow
 
     answer = folder / "verdict.json"
@@ -229,7 +228,7 @@ def explain(folder: Path, model: list[str]) -> dict:
 
 
 def saying(overall: str, *names: str) -> dict:
-    """A verdict that knows nothing but names."""
+    """A verdict that holds names alone."""
     findings = [
         {"name": name, "verdict": "FOUND", "estimate": 0.0, "sd": 1e9, "floor": 1.0}
         for name in names
@@ -243,23 +242,23 @@ def saying(overall: str, *names: str) -> dict:
 
 
 def blind(_: Path, __: list[str]) -> dict:
-    """A spoilt tool: nothing is ever there."""
+    """A spoilt tool that never finds an effect."""
     return saying("NO EFFECT")
 
 
 def reader_of_file_names(folder: Path, _: list[str]) -> dict:
-    """A spoilt tool: the name of the first file says it all."""
+    """A spoilt tool that answers with the name of the first file."""
     name = sorted(folder.glob("*.npz"))[0].stem.partition("-")[2]
     return saying("KNOWN", name)
 
 
 def always(name: str) -> Tool:
-    """A spoilt tool: it was this effect, as it mostly is."""
+    """A spoilt tool that always names one frequent effect."""
     return lambda folder, model: saying("KNOWN", name)
 
 
 def once(tool: Tool) -> Tool:
-    """The same tool, which remembers what it said of the same files and model."""
+    """The same tool with a cache of its answers by files and model."""
     answers: dict[str, str] = {}
 
     def ask_once(folder: Path, model: list[str]) -> dict:
@@ -275,7 +274,7 @@ def once(tool: Tool) -> Tool:
 
 
 def exchanged(one: str, other: str, real: Tool = explain) -> Tool:
-    """A spoilt tool: the real one, which takes two effects for each other."""
+    """A spoilt tool: the real one with two effects exchanged."""
     names = {one: other, other: one}
 
     def tool(folder: Path, model: list[str]) -> dict:

@@ -12,7 +12,9 @@ G = 9.81
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 
 LATE = -0.005
-"""The test's motors follow a smooth command; its samples, held, come half a sample late [s]."""
+"""The test's motors follow a smooth command; its samples, held for a period, lag by half a sample
+[s].
+"""
 
 
 def attitude(time: np.ndarray) -> Rotation:
@@ -40,8 +42,8 @@ def fly(
     downwash=0.0,
     mount=(0.0, 0.0, 0.0),
 ) -> FlightLog:
-    """A vehicle with an attitude of closed form and motors that hold it up; equations and
-    integrator of the test's own.
+    """A vehicle with a closed-form attitude and motors that hold it up; equations and integrator
+    share no code with the package.
     """
     rng = np.random.default_rng(seed)
     mass = 0.03

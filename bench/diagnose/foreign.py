@@ -6,13 +6,12 @@ controller, for named vehicles.
 
 Written from the equations alone: bodies in maximal coordinates with the cable as a constraint
 (Udwadia and Kalaba 1992), the controller of Lee, Leok and McClamroch 2010, rotors with a lag,
-Runge-Kutta steps. Noise, sampling and names are its own. A world hides one thing or nothing, or a
-force that no catalogue holds, and the tool is asked with the numbers of the vehicle that its owner
-would have.
+Runge-Kutta steps. Noise, sampling and names are its own. A world hides one effect, none, or a force
+outside the catalogue; the tool gets the vehicle's numbers as its owner would know them.
 
 Each line of the seed list is a seed; vehicle, kind and size follow from it. A list is used once:
-what it shows is mended on other seeds. The worlds of ``bank-foreign.txt`` were flown without drag,
-so that no wind could show, and knew one foreign force."""
+faults that it shows are mended on other seeds. The worlds of ``bank-foreign.txt`` were flown
+without drag, so that no wind could show, and knew one foreign force."""
 
 import argparse
 import json
@@ -73,12 +72,12 @@ ALIKE = (
     {"frame_tilt_y", "marker_rot_y", "wind_x"},
     {"motor_tau", "cmd_delay", "pose_delay"},
 )
-"""What flights of this kind may take for one another: a class is right that holds the truth and is
+"""Effects that such flights hardly distinguish: a class is right if it holds the truth and lies
 within one of these.
 """
 FOREIGN = ("swirl", "beat", "wake", "side")
-"""Forces on the vehicle that no catalogue holds: across its velocity; in time alone; after what it
-did; to the left or right by its way.
+"""Forces on the vehicle outside the catalogue: across its velocity; periodic in time; by its past
+velocity; sideways by its direction.
 """
 STRENGTH = {"swirl": 0.25, "beat": 0.2, "wake": 0.25, "side": 0.15}
 """In the whole mass: [1/s], [m/s^2], [1/s], [m/s^2]."""
@@ -116,7 +115,7 @@ def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
 
 
 def known(name: str) -> FlyerParams:
-    """The vehicle as its owner knows it."""
+    """The vehicle's numbers as its owner knows them."""
     c = CRAFT[name]
     return FlyerParams(
         input="thrust_command",
@@ -141,7 +140,7 @@ def known(name: str) -> FlyerParams:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Of two vectors: numpy's own takes ten times as long."""
+    """Cross product of two vectors: numpy's takes ten times as long."""
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
@@ -264,7 +263,7 @@ def recorded(
     sent: np.ndarray,
     rng: np.random.Generator,
 ) -> FlightLog:
-    """What the capture sees at its own rate, with double exponential noise, rounded to a tenth of a
+    """The capture's poses at its rate, with double exponential noise, rounded to a tenth of a
     millimetre; the throttle as sent.
     """
     from scipy.interpolate import CubicSpline
@@ -293,7 +292,7 @@ def recorded(
 
 
 def diagnose_world(seed: int) -> dict:
-    """A world, and what the tool says of it."""
+    """Fly a world and diagnose it; returns a line of the ledger."""
     name, hidden, world = drawn(seed)
     line = {"seed": seed, "vehicle": name, "hidden": hidden}
     begin = time.process_time()
@@ -313,8 +312,8 @@ def diagnose_world(seed: int) -> dict:
 
 
 def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
-    """Of an answer: right, class, missed, false, and of what no catalogue holds unknown, or part
-    where names are told beside it.
+    """Judgement of an answer: right, class, missed or false; for a force outside the catalogue
+    unknown, or part where names are given beside it.
     """
     if not hidden:
         return "false" if groups else "right" if overall == "NO EFFECT" else "unsure"
@@ -334,7 +333,7 @@ def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
 
 
 def main() -> None:
-    """Ask about every seed of a list; a line for each, and what came of them."""
+    """Diagnose the world of every seed of a list; writes a line for each, and prints the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)

@@ -1,16 +1,15 @@
-"""What ledgers of sealed worlds say: accuracy, completeness, coverage, gain against the oracle;
-with intervals.
+"""Tables of sealed worlds' ledgers: accuracy, completeness, coverage, gain against the oracle; with
+intervals.
 
     python -m bench.diagnose.ledger ledger.jsonl [more.jsonl] --out FOLDER     # prints Markdown,
     draws completeness.png
 
-A world in which the tool failed counts as one in which nothing was named. One whose verdict was not
-waited for, because the bank's time was over, counts for nothing but the column that says how many
-there are.
+A world in which the tool failed counts as one in which nothing was named. One whose verdict was cut
+off by the bank's time limit counts in no column but its own.
 
-Of the 1,924 seeds that the shipped ledger's banks asked for, 13 have no line, and no reason was
-kept: 11 of them are of the bank of b5d7a9d, among these five of its 15 laws (seeds 89700501 and
-on). 23 lines are of worlds that ran out of time, nine of them laws."""
+Of the 1,924 seeds of the shipped ledger's banks, 13 have no line, for unknown reasons: 11 belong to
+the bank of b5d7a9d, among these five of its 15 laws (seeds 89700501 and on). 23 lines are worlds
+that ran out of time, nine of them laws."""
 
 import argparse
 import json
@@ -45,23 +44,23 @@ LIMITS = {
     "camera_tilt_x": (math.radians(0.2), math.degrees(1.0), "deg"),
     "camera_latency": (1e-3, 1e3, "ms"),
 }
-"""Effect -> limit that is asked for (SI), factor and unit to print."""
+"""Effect -> required detection limit (SI), factor and unit to print."""
 
 RANDOM = {"release_lag": "lag_jitter", "cmd_delay": "cmd_jitter", "wind_x": "gust"}
 """Random effects of the catalogue: effect -> its name where it differs from flight to flight."""
 LEVELS = (50, 80, 95)
 MATTERS = 5.0
-"""Nats on unseen throws that the truth must be worth for a gain to be counted."""
+"""Nats that the truth must gain on held-out throws for a gain to be counted."""
 HARM = 1.01
 HARM_NATS = 3.0
-"""Growth of the error on unseen throws, per sample in its deviations, and fall of their log
+"""Increase of the error on held-out throws, per sample in its deviations, and decrease of their log
 likelihood, that count as harm.
 """
 NINE = math.log(9.0)
 DECADE = math.log(10.0)
-WIDTHS = (0.05, 3.0)  # from 50 to 90 % in log size: what is possible
+WIDTHS = (0.05, 3.0)  # from 50 to 90 % in log size: the prior's range
 GRID = 160  # points of the grid of curves
-FEWEST = 6  # worlds of an effect for a curve of its own
+FEWEST = 6  # least worlds of an effect for a separate curve
 BINNED = 30  # worlds of an effect for counts in bins
 WITH_CAMERA = ", camera"
 
@@ -86,11 +85,11 @@ def share(k: int, n: int) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """What worlds tell of ``log odds of being named = a + b log size``: points of a grid and how
-    likely each is.
+    """Posterior of ``log odds of being named = a + b log size``: points of a grid and their
+    probabilities.
     """
 
-    half: np.ndarray  # log of the size that is named with 50 %
+    half: np.ndarray  # log of the size that is named with 50 % probability
     width: np.ndarray  # from there to 90 %, in log size
     weight: np.ndarray
 
@@ -137,8 +136,8 @@ def curve(size: np.ndarray, named: np.ndarray) -> Curve:
 
 
 def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1.0) -> str:
-    """A size and its interval as text, times ``scale``; what lies outside the sizes that were flown
-    is told as that alone.
+    """A size and its interval as text, times ``scale``; values outside the flown sizes appear as a
+    bound.
     """
     least = size.min()
     most = size.max()
@@ -150,7 +149,7 @@ def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1
 
 
 def met(found: tuple[float, float, float], limit: float) -> str:
-    """Whether a size and its interval keep to a limit."""
+    """Whether a size and its interval lie below a limit."""
     if math.isnan(limit):
         return "-"
     return "yes" if found[2] <= limit else "no" if found[1] > limit else "not resolved"
@@ -210,12 +209,12 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
 
 
 def dusty(world: dict) -> bool:
-    """Whether a world has some of every effect."""
+    """Whether a world has a little of every effect."""
     return bool(world["recipe"].get("dust"))
 
 
 def answered(worlds: Sequence[dict]) -> list[dict]:
-    """Worlds whose verdict was waited for."""
+    """Worlds whose verdict was not cut off."""
     return [w for w in worlds if w.get("error") != NOT_WAITED]
 
 
@@ -231,7 +230,7 @@ def singles(worlds: Sequence[dict]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Effect -> sizes in floors and whether they were named (up to class), of worlds with one
     hidden effect.
 
-    What a camera helps to see, without being its own effect, stands apart, as "EFFECT, camera".
+    Effects that are not the camera's, in worlds with a camera, stand apart, as "EFFECT, camera".
     """
     out: dict[str, list] = defaultdict(list)
     for w in worlds:
@@ -249,13 +248,11 @@ def singles(worlds: Sequence[dict]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def completeness(worlds: Sequence[dict]) -> list[str]:
-    """Table of the sizes named with 50 and 90 % probability, the effects that are asked
-    for first.
-    """
+    """Table of the sizes named with 50 and 90 % probability; those with a required limit first."""
     curves = singles(worlds)
     if not curves:
         return []
-    head = "| effect | worlds | sizes | named | unit | 50 % | 90 % | asked for | kept |"
+    head = "| effect | worlds | sizes | named | unit | 50 % | 90 % | required | kept |"
     lines = [head, "|---|---:|---|---|---|---|---|---:|---|"]
     whole = tuple(np.concatenate([v[i] for v in curves.values()]) for i in range(2))
     for name in [
@@ -292,8 +289,8 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
 
 
 def intervals(worlds: Sequence[dict]) -> list[str]:
-    """Coverage of the intervals of the effects that were named by their own names, by what there is
-    besides them.
+    """Coverage of the intervals of correctly named effects, by the number of other effects in the
+    world.
     """
     groups = {
         "nothing else": [w for w in worlds if not dusty(w)],
@@ -334,15 +331,13 @@ def coverage(worlds: Sequence[dict]) -> list[str]:
 
 
 def gain_ratio(held: dict) -> float:
-    """Share of the oracle's nats on unseen throws; NaN where the truth gains next to
-    nothing there.
-    """
+    """Share of the oracle's nats on held-out throws; NaN where the truth gains almost nothing."""
     gained = held["before"] - held.get("oracle", math.inf)
     return (held["before"] - held["after"]) / gained if gained > MATTERS else math.nan
 
 
 def gains(worlds: Sequence[dict]) -> list[str]:
-    """Gain on throws that were held back, in parts of what the truth gains there, and harm."""
+    """Gain on held-out throws as a share of the truth's gain, and harm."""
     lines = [
         (
             "| kind | worlds | median, of the oracle's gain | worst tenth | where something was"
@@ -376,7 +371,7 @@ def gains(worlds: Sequence[dict]) -> list[str]:
 
 
 def laws(worlds: Sequence[dict]) -> list[str]:
-    """What became of laws outside the catalogue."""
+    """Table of the verdicts on laws outside the catalogue."""
     hidden = [(w, next(iter(w["recipe"]["effects"]))) for w in worlds if w["kind"] == "law"]
     if not hidden:
         return []
@@ -387,7 +382,7 @@ def laws(worlds: Sequence[dict]) -> list[str]:
     n = len(hidden)
     return [
         f"- UNKNOWN: {share(sum(w.get('unknown', False) for w, _ in hidden), n)}",
-        f"- a wrong name besides: {share(sum(bool(w.get('named')) for w, _ in hidden), n)}",
+        f"- a wrong name as well: {share(sum(bool(w.get('named')) for w, _ in hidden), n)}",
         (
             f"- the true term is the best formula: {share(ranks.count(1), n)}; among the best"
             f" three: {share(n - ranks.count(None), n)}"
@@ -396,8 +391,8 @@ def laws(worlds: Sequence[dict]) -> list[str]:
 
 
 def draw(worlds: Sequence[dict], path: Path) -> None:
-    """Completeness by size: a panel of all effects and one of each whose limit is asked for, with
-    the curve and its 95 % band.
+    """Completeness by size: a panel of all effects and one of each with a required limit, with the
+    curve and its 95 % band.
     """
     import matplotlib
 
@@ -425,7 +420,7 @@ def draw(worlds: Sequence[dict], path: Path) -> None:
         axis.set_ylabel("share that was named")
     figure.suptitle(
         "Share named by size: worlds (ticks), bins and logistic curve with 95 % intervals; red:"
-        " size asked for at 90 %"
+        " size required at 90 %"
     )
     figure.savefig(path, dpi=110)
     plt.close(figure)
@@ -490,7 +485,7 @@ def summary(worlds: Sequence[dict]) -> str:
 
 
 def right(world: dict) -> bool:
-    """Whether a world was told as what it is, in the headline too.
+    """Whether a world's verdict is right, its overall verdict too.
 
     Nothing hidden: NO EFFECT. A law: UNKNOWN and no name. Lost commands, and what differs from
     flight to flight or from day to day: KNOWN for it, and no name. Effects: KNOWN, each up to
@@ -521,8 +516,8 @@ def right(world: dict) -> bool:
 
 
 def kinds(worlds: Sequence[dict]) -> list[str]:
-    """How many worlds of each kind were told as what they are, and how they were told otherwise."""
-    lines = ["| kind | told as what it is | else | seconds |", "|---|---|---|---|"]
+    """Table of the right verdicts by kind, and of the wrong ones."""
+    lines = ["| kind | right verdicts | wrong verdicts | seconds |", "|---|---|---|---|"]
     for kind, group in sorted(grouped(worlds, lambda w: w["kind"]).items()):
         wrong_verdicts = Counter(w.get("overall") for w in group if not right(w))
         other = ", ".join(f"{overall} {count}" for overall, count in sorted(wrong_verdicts.items()))
@@ -550,7 +545,7 @@ def plants(worlds: Sequence[dict]) -> list[str]:
 
 
 def failures(worlds: Sequence[dict]) -> list[str]:
-    """Worlds with a wrong name or without an answer, one a line."""
+    """Worlds with a wrong name or without an answer, one per line."""
     lines = []
     for w in sorted(worlds, key=lambda w: (w["kind"], w["recipe"]["plant"])):
         given, right = names(w)[:2]
@@ -576,7 +571,7 @@ def read(paths: Sequence[Path]) -> list[dict]:
 
 
 def main() -> None:
-    """Print what ledgers say as Markdown, and draw it."""
+    """Print the tables of ledgers as Markdown, and draw completeness."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("ledgers", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, help="folder for completeness.png")

@@ -1,11 +1,10 @@
-"""Sealed worlds: hide, fly, hand the logs over in a folder, read the verdict, and only then open
-the truth.
+"""Sealed worlds: hide effects, fly, hand over a folder of logs, read the verdict, and only then
+compare with the truth.
 
-The tool runs in a process of its own that cannot import the tests, in a folder that holds nothing
-but logs and the config of the model. The truth's SHA-256 is put down before, the verdict's after.
-
-Three more throws of each world are held back; the model with the verdict's sizes and the model with
-the true ones predict them.
+The tool runs in a separate process that cannot import the tests, in a folder that holds only logs
+and the model's configuration. The truth's SHA-256 is recorded before, the verdict's after. Three
+more throws of each world are held out; the models with the verdict's sizes and with the true ones
+predict them.
 
     python -m bench.diagnose.sealed null=10 1x15=20 2x10=5 curve=50 sight=20 law=5 \\
         --jobs 8 --ledger ledger.jsonl
@@ -59,7 +58,7 @@ ALIKE = (
         "thrust_gain",
         "mass_quad",
         "air_density",
-    },  # only the ratio of thrust to weight shows, of a vehicle that nobody weighed
+    },  # only the ratio of thrust to weight shows, of a vehicle of unknown mass
     {
         "mass_payload",
         "rope_mass",
@@ -83,16 +82,16 @@ BEYOND = {"law_power_drag": 0.06, "law_sink_push": 0.08}
 """Laws that no term of the tool's grammar has: an exponent between, a switch."""
 
 MEASURED = ("--measured", "air_density=0.003")
-"""What whoever asks has measured: barometer and thermometer of the hall.
+"""Measurements that the user states: barometer and thermometer of the hall.
 
 In all these worlds the air is as dense as the model's.
 """
 
 NOT_WAITED = "timeout"
-"""Error of a world whose verdict was not waited for."""
+"""Error of a world whose verdict was cut off by the time limit."""
 
 JUDGED = ("exact", "class", "own_class", "wrong", "missed")
-"""What is counted of the worlds that were answered."""
+"""Fields that are counted over the answered worlds."""
 
 TERMS = {
     "law_ball_swirl": "F_p = c (z x v_p)",
@@ -115,11 +114,11 @@ CURVE = (
     "frame_tilt_x",
     "thrust_gain",
 )
-"""Effects whose detection limits are asked for, of plants without a camera."""
+"""Effects with a required detection limit, of plants without a camera."""
 SIGHT = ("camera_tilt_x", "camera_latency", "marker_rot_x", "mocap_delay_quad")
-"""Likewise with a camera, and what they may be taken for."""
+"""Effects with a required detection limit with a camera, and effects that resemble them."""
 HELD = 3
-"""Throws held back."""
+"""Held-out throws."""
 VARIES = {
     "release_lag": (5e-3, 12e-3),
     "wind_x": (0.5, 1.2),
@@ -145,8 +144,8 @@ LIMIT = "limit:"
 NULL = "null:"
 VARYING = "varies:"
 DRIFTING = "drifts:"
-"""Begin of the kinds that hide one effect, by its name, about its limit; nothing; one that differs
-from flight to flight, or by day.
+"""Prefixes of the kinds that hide one named effect about its limit; nothing; one that differs from
+flight to flight, or by day.
 """
 DAYS = 4
 """Of worlds with effects that drift."""
@@ -198,7 +197,7 @@ def model_of(recipe: Recipe) -> list[str]:
 
 
 def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Path]:
-    """Fly a world and write its logs; those held back into a folder of their own."""
+    """Fly a world and write its logs; held-out ones into a separate folder."""
     paths = []
     records = recorded(recipe, fly_recipe(recipe))
     shown = len(records) - recipe.held
@@ -213,8 +212,8 @@ def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Pa
 def ask(
     logs: list[Path], model: list[str], folder: Path, device: str = "cpu", timeout: float = 900.0
 ) -> dict:
-    """Verdict of ``visthrow diagnose explain`` on logs, run apart; with ``error`` where it failed
-    or took longer [s].
+    """Verdict of ``visthrow diagnose explain`` on logs, run in a separate process; with ``error``
+    where it failed or exceeded its time [s].
     """
     answer = folder / "verdict.json"
     command = [sys.executable, "-c", WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
@@ -258,12 +257,12 @@ def ask(
 def on_held_back(
     recipe: Recipe, answers: dict[str, dict[str, float]], held: Path
 ) -> dict[str, float]:
-    """Return the nats by which the throws held back are explained worse by the model as it was
-    (``before``), and by the sizes of each answer, than by the truth.
+    """Return the nats by which the plain model (``before``) and the sizes of each answer explain
+    the held-out throws worse than the truth does.
 
-    See :func:`~bench.diagnose.shortfalls.shortfalls`; the truth is the ``oracle``, with 0, and
-    ``samples`` their number. A law outside the catalogue has no size: it is the model as it was
-    then that has 0."""
+    See :func:`~bench.diagnose.shortfalls.shortfalls`; the truth is the ``oracle``, with 0;
+    ``samples`` is their number. A law outside the catalogue has no size: the plain model then has
+    0."""
     from bench.diagnose.shortfalls import shortfalls
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import load_experiment, plant_of
@@ -298,18 +297,17 @@ def named_by(verdict: dict) -> list[set[str]]:
 
 
 def near(group: set[str], truth: set[str]) -> set[str]:
-    """Hidden effects that a name, or a class of names, stands for: themselves, or what flights
-    hardly tell from them.
+    """Hidden effects that a name, or a class of names, matches: the same, or ones that flights
+    hardly distinguish.
     """
     return {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
 
 
 def matched(groups: list[set[str]], truth: set[str]) -> list[str]:
-    """For each name, or class of names, the hidden effect that it stands for, each once; "" where
-    there is none.
+    """The hidden effect that each name, or class of names, matches, each once; "" where there is
+    none.
 
-    Those that are hidden stand for themselves before what flights hardly tell from others stands
-    for these."""
+    Exact matches come before effects that flights hardly distinguish."""
     out = [""] * len(groups)
     left = set(truth)
     for meant in (set.intersection, near):
@@ -355,9 +353,7 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
 
 
 def errors_of(recipe: Recipe, verdict: dict) -> list[dict]:
-    """Of each hidden effect, what its own finding says: named or not, estimate, deviation,
-    interval, evidence.
-    """
+    """The finding of each hidden effect: named or not, estimate, deviation, interval, evidence."""
     findings = {f["name"]: f for f in verdict["findings"]}
     kept = ("verdict", "estimate", "sd", "low", "high", "floor", "nats")
     return [
@@ -377,7 +373,7 @@ def run_world(
         recipe: of the world.
         device: of the diagnosis.
         verdicts: folder for the whole verdict.
-        until: when the verdict must be there, by ``time.time()`` [s].
+        until: deadline of the verdict, by ``time.time()`` [s].
     """
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
         folder = Path(name)
@@ -417,7 +413,7 @@ def run_world(
 
 
 def _known(kind: str, begin: str, names: Iterable[str]) -> str:
-    """What stands behind the begin of a kind.
+    """The name that follows the prefix of a kind.
 
     Raises:
         ValueError: It is none of the names.
@@ -439,9 +435,9 @@ def drawn(kind: str, number: int) -> Recipe:
     ``null:COLOUR`` hides nothing behind noise of one of COLOURS, ``varies:NAME`` an effect that
     differs from flight to flight, ``drifts:NAME`` one that differs from day to day, ``lost``
     commands that never arrive, ``beyond`` a law outside the tool's grammar. Those with a camera are
-    ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects whose
-    limits are asked for, ``limit:NAME`` the one that it names, about its limit, ``camera`` any of a
-    camera's, ``clear`` none. ``KIND+dust`` is the same with some of every other effect."""
+    ``sight``, ``camera`` and ``clear``. ``curve`` and ``sight`` hide one of the effects with a
+    required limit, ``limit:NAME`` the named one, about its limit, ``camera`` any of a camera's,
+    ``clear`` none. ``KIND+dust`` adds a little of every other effect."""
     if kind.endswith(DUSTY):
         return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
     rng = np.random.default_rng(number + 7)
@@ -518,7 +514,7 @@ def bank(seed: int, sizes: dict[str, int]) -> list[tuple[str, Recipe]]:
 
 
 def _alone(numbers) -> None:
-    """Give a worker a core of its own: what it starts counts that one only."""
+    """Pin a worker to one core: processes that it starts count that one only."""
     cores = sorted(os.sched_getaffinity(0))
     with numbers.get_lock():
         mine = numbers.value
@@ -542,7 +538,7 @@ def _one(task: tuple[str, Recipe, float, float, Path | None]) -> dict | None:
 
 
 def warm(plant: str) -> None:
-    """Compile what worlds of a plant need, by the smallest one."""
+    """Compile the kernels of a plant by flying its smallest world."""
     line = run_world(Recipe(5, plant, {"com_x": 0.002}, free=1, free_seconds=2.0, throws=1, held=1))
     print(
         plant, line["overall"], line["fly_s"], line["explain_s"], line.get("error", ""), flush=True
@@ -550,9 +546,7 @@ def warm(plant: str) -> None:
 
 
 def main() -> None:
-    """Run a bank of sealed worlds and add it to a ledger; worlds that are there are not
-    run again.
-    """
+    """Run a bank of sealed worlds and append it to a ledger; worlds in the ledger are skipped."""
     parser = argparse.ArgumentParser(
         description=main.__doc__,
         fromfile_prefix_chars="@",
@@ -577,7 +571,7 @@ def main() -> None:
         "--end",
         type=float,
         default=1e6,
-        help="minutes after which a verdict that is not there is none",
+        help="minutes after which a missing verdict counts as cut off",
     )
     parser.add_argument(
         "--warm", choices=PLANTS, help="only compile what worlds of this plant need"

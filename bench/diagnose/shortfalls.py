@@ -1,4 +1,4 @@
-"""How far models fall short of the true one on flights that none of them was found in."""
+"""Likelihood that models lose against the true one on held-out flights."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,8 +12,7 @@ from visthrow.diagnose.models.model_interface import Model
 
 
 def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:
-    """How much worse than by the last of some sizes flights are explained that none of them was
-    found in.
+    """Nats by which each of some sizes explains held-out flights worse than the last one does.
 
     Initial states and gusts are integrated out (a forecast without gusts would mostly measure
     those); the levels of noise and gusts are those of the last sizes.

@@ -1,12 +1,12 @@
-"""Pendulums, and vehicles in slow flight, of another author's hand: nothing is hidden, or a force
-that no catalogue holds.
+"""Pendulums, and vehicles in slow flight, by another author's generator: nothing is hidden, or a
+force outside the catalogue.
 
     python -m bench.diagnose.small --seeds 8 --ledger small.jsonl
 
 Written from the equations alone. A pendulum is a mass in the plane on a rod, the rod a constraint
 (Udwadia and Kalaba 1992), integrated by scipy; its encoder has lines, and scatters. A vehicle in
-slow flight is a balance of four thrusts that scatters; near the ground they are worth more
-(Cheeseman and Bennett 1955)."""
+slow flight is a balance of four thrusts with noise; near the ground they are larger (Cheeseman and
+Bennett 1955)."""
 
 import argparse
 import json
@@ -93,7 +93,7 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
 
 
 def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> FlightLog:
-    """One slow flight up and down, as its motors and a capture log it."""
+    """Logs of one slow flight up and down, by its motors and a capture."""
     stamps = np.arange(0.0, seconds, 0.02)
     low = rng.uniform(0.2, 0.35)
     high = rng.uniform(1.0, 1.6)
@@ -125,7 +125,7 @@ WORLDS = {
     "pendulum": (swung, PendulumModel, SWING, ("", *PULLS)),
     "trim": (hovered, TrimModel, HOVER, ("", "ground")),
 }
-"""Generator, model of the diagnosis, what its owner knows, and what may be hidden."""
+"""Generator, model of the diagnosis, numbers that its owner knows, and laws that may be hidden."""
 
 
 def logs_of(kind: str, law: str, seed: int, count: int = 4) -> list[FlightLog]:
@@ -134,7 +134,7 @@ def logs_of(kind: str, law: str, seed: int, count: int = 4) -> list[FlightLog]:
 
 
 def model_of(kind: str, logs: list[FlightLog]) -> NumericModel:
-    """The model, with what its owner knows."""
+    """The model, with the numbers that its owner knows."""
     return WORLDS[kind][1](logs, WORLDS[kind][2])
 
 
@@ -144,7 +144,7 @@ def formula(kind: str, law: str) -> str:
 
 
 def diagnose_world(kind: str, law: str, seed: int) -> dict:
-    """A world, and what the tool says of it."""
+    """Fly a world and diagnose it; returns a line of the ledger."""
     line = {"kind": kind, "law": law, "seed": seed}
     try:
         diagnosis = diagnose_flights.explain(model_of(kind, logs_of(kind, law, seed)), seed=seed)
@@ -159,7 +159,7 @@ def diagnose_world(kind: str, law: str, seed: int) -> dict:
 
 
 def main() -> None:
-    """Ask about worlds of every kind."""
+    """Diagnose worlds of every kind."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, required=True, help="of each kind")
     parser.add_argument("--ledger", type=Path, required=True)

@@ -5,10 +5,10 @@
         --foreign bench/diagnose/bank-foreign-confirm.txt
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
-With one tree it is answered alone, as the new one.
-Each world is flown once, by this checkout, and its logs are handed to both tools in processes of
-their own, on the same core one after the other. Worlds come in an order that the seeds fix,
-so that whatever was answered before the time is over is a balanced part of the banks.
+With one tree only that one answers, as the new one. Each world is flown once, by this checkout, and
+its logs are handed to both tools in processes of their own, on the same core one after the other.
+Worlds come in an order that the seeds fix, so that whatever was answered before the time is over is
+a balanced part of the banks.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def answer_of(tree: str, arguments: list[str], folder: Path, until: float) -> di
 
 
 def in_turn(trees: list[str], number: int) -> list[tuple[str, str]]:
-    """Return the sides with their trees; every second world asks the new one first."""
+    """Return the sides with their trees; for every second world the new one answers first."""
     sides = list(zip(SIDES[-len(trees) :], trees))
     return sides if number % 2 else sides[::-1]
 
@@ -121,7 +121,7 @@ def answer_foreign(seed: int, trees: list[str], until: float) -> dict:
 
 
 def answer_sealed(kind: str, recipe: Recipe, trees: list[str], until: float) -> dict:
-    """Answer a sealed world; its throws held back say what both answers are worth."""
+    """Answer a sealed world; its held-out throws measure the gain of both answers."""
     line = {"bank": "sealed", "kind": kind, "recipe": asdict(recipe)}
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
         folder = Path(name)
@@ -197,7 +197,7 @@ def worlds_of(banks: Iterable[str], foreign_lists: Iterable[str]) -> list[tuple]
 
 
 def kind_of(world: tuple) -> str:
-    """Return what a world hides: its kind, or ``null`` or ``hidden`` of the other author."""
+    """Return a world's kind, or ``null`` or ``hidden`` for the other author's."""
     if world[0] == "foreign":
         return "foreign" if foreign.drawn(world[1])[1] else "foreign null"
     return world[1]
@@ -268,7 +268,9 @@ def names_right(line: dict, side: str) -> bool:
 
 
 def varies_right(line: dict, side: str) -> bool:
-    """Tell whether what differed by flight, day or command is stated, and nothing is named."""
+    """Tell whether the effect that varied by flight, day or command is reported, and nothing is
+    named.
+    """
     answer = line[side]
     expected = line["kind"].rpartition(":")[2]
     if line["kind"] == "lost":
@@ -288,7 +290,7 @@ def covered(lines: Iterable[dict], side: str) -> list[bool]:
 
 
 def gains(lines: Iterable[dict], side: str) -> np.ndarray:
-    """Return the share of the evidence on throws held back that each answer wins back."""
+    """Return the share of the lost evidence on held-out throws that each answer recovers."""
     held = [line["held"] for line in lines if "held" in line and line["held"]["before"] > 20.0]
     return np.array([1.0 - h[side] / h["before"] for h in held])
 

@@ -20,7 +20,9 @@ MOVED = (
 
 
 def thrown(policy: str, solver: str | None, target: float, args: Namespace) -> tuple[dict, list]:
-    """Throw a policy on one solver, or on its own one; returns what is kept, and landings [m]."""
+    """Throw a policy on one solver, by default its training's; returns the record, and landings
+    [m].
+    """
     changes = overrides(solver, args.substep) if solver else []
     item = load_policy(policy, args.config, [*changes, *args.overrides], args.allow)
     actor = item.policy.to(args.device).actor(args.throws)

@@ -11,7 +11,7 @@ from pathlib import Path
 LIMIT = 900  # s, for one run of a file's or a room's tests
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 LISTS = "tests/contract/test_style.py::test_each_mutation_fits_the_code"
-"""The test that notices every mutation by its text, which says nothing of the other tests."""
+"""The test that detects every mutation by its text, whatever the other tests do."""
 PYTEST = ["-x", "-q", "-p", "no:cacheprovider", "--deselect", LISTS]
 HEAVY = ["numpy", "scipy.optimize", "torch", "tensordict", "warp", "cv2", "pytest"]
 """Imported once, before the processes that run tests branch off."""

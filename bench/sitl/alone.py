@@ -3,8 +3,8 @@ address it finds.
 
     python bench/sitl/alone.py COMMAND ...
 
-Where the system grants no network namespace it says so and runs the command on this machine's
-network."""
+Where the system grants no network namespace it prints a warning and runs the command on this
+machine's network."""
 
 import ctypes
 import fcntl

@@ -1,12 +1,11 @@
 """Throws through the firmware in lock step: runner, link, firmware and vehicle take turns in one
-process, on no clock but theirs.
+process, on simulated time.
 
     python bench/sitl/alone.py python -m bench.sitl.direct --firmware PROGRAM --seeds 0 1 2    # a
     line of JSON a throw
 
 The runner is the one that flies, with its state machine, guard, back-end and recorder; poses come
-by MAVLink, commands go by MSP. The same seed gives the same throw on any machine that is not out of
-memory, as fast as it can."""
+by MAVLink, commands go by MSP. The same seed gives the same throw on any machine, at full speed."""
 
 import argparse
 import json
@@ -99,8 +98,8 @@ def opened(
     seed: int,
     bridge: type[BetaflightSitl] = BetaflightSitl,
 ) -> Iterator[tuple[Runner, Source, FlightClock, BetaflightSitl]]:
-    """Runner, its source and clock, and the bridge, joined to a firmware that stands ready; all
-    ended afterwards. See `throw`.
+    """Runner, its source and clock, and the bridge, connected to a running firmware; all are closed
+    afterwards. See `throw`.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -150,8 +149,8 @@ def throw(
         clock,
         fake,
     ):
-        # Ticks and motion capture know nothing of each other: the seed says how old the newest pose
-        # is at a tick.
+        # Ticks and motion capture are not synchronised: the seed says how old the newest pose is at
+        # a tick.
         clock.sleep_until(
             clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate)
         )

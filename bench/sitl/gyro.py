@@ -1,12 +1,13 @@
-"""What the blackbox's gyro shows beside the controller block, and why: one throw, without one after
-the other of what makes it differ.
+"""Differences between the blackbox's gyro and the controller block: one throw, from which their
+causes are removed one by one.
 
     python bench/sitl/alone.py python -m bench.sitl.gyro --seeds 100 101
 
 The blackbox records each loop of the firmware; the vehicle is the training's with the firmware's
-settings, as `diagnose apply` makes it. What windows leave of the gyro beside their initial states
-is told as its mean square about x, y and z, in deviations of its noise and of the recording's steps
-of 1 deg/s, at the 250 samples a second that `explain` looks at. The first line is as `explain` sees
+settings, as `diagnose apply` makes it. The windows' gyro residual after the fit of initial states
+is printed as its mean square about x, y and z, in deviations of its noise and of the recording's
+steps of 1 deg/s, at the 250 samples a second that `explain` uses. The first line is as `explain`
+sees
 it: the vehicle behind the firmware in steps of 2 ms, the gyro behind the firmware's filters,
 commands at the runner's stamps."""
 
@@ -97,7 +98,7 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
 
 
 def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
-    """Mean square of what windows leave of the gyro, in deviations of its noise, shape (3,)."""
+    """Mean square of the windows' gyro residual, in deviations of its noise, shape (3,)."""
     path = config.find("train", BASE)
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     file = folder / "settings.toml"
@@ -122,7 +123,7 @@ def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
 
 
 def main() -> None:
-    """Fly, take away, print."""
+    """Fly, remove the causes one by one, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[100, 101])
     parser.add_argument("--out", type=Path, default=Path("out/gyro"))

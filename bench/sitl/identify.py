@@ -1,5 +1,5 @@
-"""What our controller block gets wrong of Betaflight's: rate doublets through the firmware, the
-block fitted to them, the rest.
+"""Errors of our controller block against Betaflight's: rate doublets through the firmware, the
+block fitted to them, the residual.
 
     python bench/sitl/alone.py python bench/sitl/identify.py --out out/identify --seconds 36
 
@@ -58,7 +58,7 @@ STALL = 3
 
 NAMES = ("delay", "voltage", "gyro", "p", "i", "d", "p_yaw", "i_yaw")
 REST = ("integral_x", "integral_y", "integral_z")
-"""What the firmware's integrals held when the recording began, over their gains [rad]."""
+"""The firmware's integrals at the start of the recording, over their gains [rad]."""
 
 
 def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
@@ -81,7 +81,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     try:
         desk.take()
         clock = FlightClock(desk.fake)
-        while mocap.due(plant.time):  # what was seen before is not kept
+        while mocap.due(plant.time):  # earlier measurements are not recorded
             mocap.measure(plant.time, plant.state)
         end = plant.time + seconds
         due = plant.time + 2.0
@@ -196,8 +196,8 @@ class Windows:
         )
 
     def controller(self, vehicle: VehicleParams, rest: np.ndarray) -> dict[str, np.ndarray]:
-        """Integral, smoothed set-point and gyro of the block at each period of the whole flight, by
-        what it was asked and flew.
+        """Integral, smoothed set-point and gyro of the block at each period of the whole flight,
+        from commands and measured rates.
         """
         c = vehicle.controller
         rows = self.flight

@@ -1,5 +1,5 @@
-"""Landings of throws through the firmware, predicted open loop: by the training's vehicle, by the
-firmware's settings, by what was named.
+"""Open-loop predictions of landings of throws through the firmware: by the training's vehicle, by
+the firmware's settings, by the diagnosis.
 
     visthrow diagnose explain out/firmware/10*/... --plant out/doc.toml --out out/explain
         # of other throws

@@ -1,13 +1,12 @@
-"""From the newest pose on the wire to the command on the wire, through the firmware's own link,
-beside the runner's own share.
+"""Latency from the newest pose on the wire to the command on the wire, through the firmware's link,
+and the runner's share of it.
 
     python bench/sitl/alone.py python -m bench.sitl.latency --seconds 25
 
 Bridge and runner are processes of their own, in real time. The kernel stamps each packet on the
 loopback interface (a packet socket, which a network namespace of one's own grants): poses of the
 vehicle go to the runner by MAVLink, sticks to the firmware by MSP. Commands are not held back here.
-The runner's own share is its stage ``total``: from its look for messages to the command's bytes
-out."""
+The runner's share is its stage ``total``: from reading messages to writing the command's bytes."""
 
 import argparse
 import json
@@ -39,7 +38,7 @@ UDP = 8
 
 
 class Wire(threading.Thread):
-    """What goes over the loopback interface: kernel's stamps [s] of the vehicle's poses and of set
+    """Packets on the loopback interface: kernel's stamps [s] of the vehicle's poses and of set
     sticks.
     """
 
@@ -59,7 +58,7 @@ class Wire(threading.Thread):
         """Listen until the process ends."""
         while True:
             data, more, _, where = self._socket.recvmsg(65536, 256)
-            # each packet is seen as it goes out and as it comes in
+            # each packet appears twice, outgoing and incoming
             if where[2] == socket.PACKET_OUTGOING:
                 continue
             seconds, nanoseconds = STAMP.unpack(more[0][2])

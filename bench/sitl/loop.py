@@ -1,4 +1,4 @@
-"""The loop closed on Betaflight's firmware: throws before, what the diagnosis found, throws after.
+"""The loop closed on Betaflight's firmware: throws before, the diagnosis, throws after.
 
     python -m bench.sitl.loop
         # the committed record
@@ -8,8 +8,8 @@
 
 Each series is twenty throws at 1.5, 2.0 and 2.5 m through the firmware, in lock step, poses with 1
 mm and 0.2 deg of noise at 100 Hz, and the same throws on our own block with the policy's own
-vehicle (``own``). A series that was cut goes on where it was. The record keeps error and separation
-of each throw; the runs and the firmware's blackboxes are left in the folder."""
+vehicle (``own``). An interrupted series resumes. The record keeps error and separation of each
+throw; runs and blackboxes stay in the folder."""
 
 import argparse
 import json
@@ -33,7 +33,7 @@ DISTANCES = (2.0, 1.5, 2.5)
 
 
 def flown(where: str, distance: float, seed: int, policy: str, plant: str, folder: Path) -> dict:
-    """One throw, through the firmware or on our own block; what became of it."""
+    """Fly one throw, through the firmware or on our block; returns its line."""
     params = config.load(
         HilParams,
         config.find("hil", "betaflight_sitl"),
@@ -66,7 +66,7 @@ def flown(where: str, distance: float, seed: int, policy: str, plant: str, folde
 
 
 def series(args: argparse.Namespace) -> list[dict]:
-    """All throws of a series that are not there yet."""
+    """Fly the missing throws of a series."""
     args.out.mkdir(parents=True, exist_ok=True)
     lines = args.out / f"{args.name}.jsonl"
     found = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []

@@ -1,5 +1,5 @@
-"""MSP OVERRIDE on Betaflight in software: a pilot hovers, hands over, and what the sticks do when
-the runner is gone; a line of JSON a case.
+"""MSP OVERRIDE on Betaflight in software: a pilot hovers, hands over, and the runner is killed;
+prints the sticks' values, a line of JSON per case.
 
     python bench/sitl/alone.py python -m bench.sitl.override --firmware PROGRAM
 """
@@ -44,8 +44,8 @@ def fly(
     Args:
         program: the firmware. folder: of the flight, made anew.
         overrides: of the configuration. policy: None for the configuration's.
-        until: state in which the runner is killed; then what the firmware's sticks do is watched,
-            and the pilot switches off. Empty: a throw is flown to its landing.
+        until: state in which the runner is killed; then the firmware's sticks are recorded, and the
+            pilot switches off. Empty: a throw is flown to its landing.
         seed: of start, noise and loss.
     """
     params = config.load(
@@ -78,9 +78,7 @@ def fly(
 
 
 def _watch(runner: Any, clock: Any, fake: Piloted) -> dict[str, Any]:
-    """Close the runner's port, and tell what the sticks and the vehicle do; then the pilot switches
-    off.
-    """
+    """Close the runner's port, and report sticks and vehicle; then the pilot switches off."""
     last = fake.firmware[:STICKS]
     begun = clock.now()
     start_w = fake.plant.state["pos_w"].copy()

@@ -1,6 +1,4 @@
-"""A pilot with a transmitter of its own flies Betaflight in software, and hands over by MSP
-OVERRIDE.
-"""
+"""A pilot with a transmitter flies Betaflight in software, and hands over by MSP OVERRIDE."""
 
 import socket
 import struct

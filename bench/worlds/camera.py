@@ -59,13 +59,13 @@ def outline(ball: np.ndarray, radius: float) -> np.ndarray:
 def marks(
     flight, lane: int, time: np.ndarray, goal: np.ndarray, w
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a perfect detector marks of the scene at times: corners (T, 4, 2) and sides of the box
-    (T, 4, 2) [px].
+    """Marks of a perfect detector at given times: corners (T, 4, 2) and sides of the box (T, 4, 2)
+    [px].
 
     Each side is given as a point, left, top, right, bottom, of which one coordinate is the box's.
 
     Returns:
-        Points, shape (T, 8, 2), and which of them are seen, shape (T, 8).
+        Points, shape (T, 8, 2), and which of them are visible, shape (T, 8).
     """
     q = sampled(flight.time, flight.quat[lane], time)
     body = matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
@@ -97,7 +97,7 @@ def looked(
     dropouts: float,
     rng: np.random.Generator,
 ) -> dict:
-    """What the camera's detector put down in a flight; of the ball until it has ``landed`` [s].
+    """Recordings of the camera's detector in a flight; of the ball until it has ``landed`` [s].
 
     Returns:
         ``look_time`` (N,); ``look``, points in units of the edge of the view of the camera as it is
@@ -106,7 +106,7 @@ def looked(
     """
     stamps = np.arange(0.1, flight.time[-1] - 1e-9, 1.0 / RATE)
     points, visible = marks(flight, lane, stamps - w.camera_late, goal, w)
-    # each point's row has its own time; that it moves meanwhile by a row or so matters to nothing
+    # each point's row has its time; the point's motion by about a row meanwhile is negligible
     if w.camera_row:
         for k in range(points.shape[1]):
             then = stamps - w.camera_late + w.camera_row * points[:, k, 1]

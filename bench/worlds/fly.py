@@ -206,7 +206,7 @@ class Hanging:
 
 
 class Flights:
-    """Everything that happened in a set of lanes; arrays over time (1 kHz), lane first."""
+    """States and commands of a set of lanes; arrays over time (1 kHz), lane first."""
 
     def __init__(self, time, pos, quat, ball, commands, release_at, separated_at, rate, volt):
         self.time = time
@@ -221,10 +221,8 @@ class Flights:
 
 
 def fly(*args, **options) -> Flights:
-    """Fly lanes of a plant, on the CPU whatever else there is; see :func:`_fly` for the
-    arguments.
-    """
-    # state is looked at and changed through views of the kernels' memory
+    """Fly lanes of a plant on the CPU; see :func:`_fly` for the arguments."""
+    # state is read and written through views of the kernels' memory
     with wp.ScopedDevice("cpu"):
         return _fly(*args, **options)
 

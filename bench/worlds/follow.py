@@ -86,15 +86,15 @@ def table_of(text: str, payload: bool) -> Table:
 
 
 class Follower(Tracker):
-    """The tracking pilot, softer so that a vehicle without payload stays calm, who adds what the
-    table asks for.
+    """The tracking pilot with lower gains, so that a vehicle without payload stays calm; it adds
+    the table's rates and thrust.
 
-    An integral brings him to the height that is asked for, whatever air or battery do to the
-    thrust, as any autopilot's does."""
+    An integral corrects the height for the air's and the battery's effects on the thrust, as any
+    autopilot's does."""
 
     gains = 2.0, 2.4, 4.5
     patience = 1.0
-    lead = 0.0  # accelerations of a table are too rough to read off how to turn
+    lead = 0.0  # accelerations of a table are too rough to derive body rates
 
     def command(self, t: float, x, v, q, hanging) -> np.ndarray:
         """See :meth:`bench.worlds.pilot.Tracker.command`."""

@@ -1,4 +1,4 @@
-"""Who flies the worlds: references and a position controller that commands collective thrust and
+"""Pilots of the worlds: references and a position controller that commands collective thrust and
 body rates at 50 Hz.
 """
 
@@ -13,9 +13,7 @@ ATTITUDE = 4.5
 lag, or 30 % less rate gain.
 """
 LEAD = 0.06
-"""How far ahead the pilot reads off the reference how to turn [s]: the delay and the motors' lag
-that he knows.
-"""
+"""Preview of the reference's attitude [s]: the known delay and the motors' lag."""
 SHAKE = np.array([0.8, 0.8, 0.0])
 """Deviation of rates that are added to free flights, to excite the vehicle [rad/s]."""
 TONES = 5

@@ -161,7 +161,7 @@ def along(b: Body, d: Body, h: REAL):
 
 @wp.func
 def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
-    """Wanted rotor speeds; fills the derivatives of integral and filters into ``rates``."""
+    """Commanded rotor speeds; fills the derivatives of integral and filters into ``rates``."""
     out = rates
     rate_command = V3(command[1], command[2], command[3])
     mean_x = REAL(0.0)

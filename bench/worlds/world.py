@@ -1,5 +1,4 @@
-"""Draw a world, hide something in it, fly it, and put down what a motion-capture hall would have
-recorded.
+"""Draw a world, hide effects in it, fly it, and record it as a motion-capture hall would.
 
 A world is a plant, hidden effects with their sizes in floors, gusts, sensor noise and flights: free
 flights that together last a minute, and throws. Everything follows from one seed."""
@@ -76,7 +75,7 @@ ONE_SIDED = (
     "rope_mass",
     "camera_latency",
 )
-"""Nothing is measured before it happens, the model's payload has no drag that reality could lack,
+"""Effects of one sign: measurements cannot come early, the model's payload has no drag to remove,
 and its rope hardly any mass.
 """
 PLANTS = ("chain", "string", "rod")
@@ -107,7 +106,7 @@ class Recipe:
     free: int = 6
     free_seconds: float = 10.0
     throws: int = 10
-    held: int = 0  # throws besides, which nobody is shown
+    held: int = 0  # held-out throws
     low: bool = False  # free flights near the ground
     camera: bool = False  # a camera looks down and a detector marks the goal and the ball
     colour: str = ""  # of the sensors' noise, one of COLOURS; white where empty
@@ -115,7 +114,7 @@ class Recipe:
     varies: dict[str, float] = field(default_factory=dict)
     days: int = 0  # on which flights are flown by turns; then for each day, not for each flight
     lost: float = 0.0  # share of commands that never arrive
-    # deviation of every other effect, in its floor: what matters to nobody, and is there in every
+    # deviation of every other effect, in its floor: negligible effects that are present in every
     # hall
     dust: float = 0.0
 
@@ -145,7 +144,7 @@ def draw(
 
 
 def dust_of(recipe: Recipe) -> dict[str, float]:
-    """Sizes of what is there besides the hidden effects and is not to be named."""
+    """Sizes of the negligible effects, which must not be named."""
     if not recipe.dust:
         return {}
     sizes = recipe.dust * np.random.default_rng([recipe.seed, 6]).standard_normal(len(FLOORS))
@@ -165,7 +164,7 @@ def world_of(recipe: Recipe):
 
 
 def worlds_of(recipe: Recipe, first: int, count: int) -> list:
-    """The worlds of some flights, each with what it has of its own."""
+    """The worlds of some flights, each with its drawn effects."""
     out = []
     for flight in range(first, first + count):
         rng = np.random.default_rng(
@@ -202,9 +201,7 @@ def sensor_noise(rng: np.random.Generator, colour: str, shape: tuple[int, int]) 
 
 
 def lanes_of(recipe: Recipe, rng: np.random.Generator):
-    """References of all flights: free ones first, then throws at rising speeds, then those held
-    back.
-    """
+    """References of all flights: free ones, then throws at rising speeds, then held-out ones."""
     free = [
         FreeFlight(rng, height=0.75 if recipe.low else 1.9, speed=0.5 if recipe.low else 1.0)
         for _ in range(recipe.free)
@@ -244,12 +241,12 @@ def fly_recipe(recipe: Recipe) -> list[Flights]:
 
 
 def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
-    """What was recorded of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame
-    was lost.
+    """Recordings of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was
+    lost.
 
     Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s),
-    ``volt`` [V]; ``release`` (its time or None); ``truth_landing`` is what the world knows and no
-    log tells. With a camera, also what :func:`bench.worlds.camera.looked` tells."""
+    ``volt`` [V]; ``release`` (its time or None); ``truth_landing``, which no log holds. With a
+    camera, also the recordings of :func:`bench.worlds.camera.looked`."""
     rng, eye, meter = (
         np.random.default_rng(seed)
         for seed in (recipe.seed + 3, [recipe.seed, 4], [recipe.seed, 5])
