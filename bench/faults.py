@@ -322,15 +322,15 @@ def faults(args: argparse.Namespace) -> Report:
             rows.setdefault(case.group, []).append((*row, *counts))
     notes = (
         (
-            f"each fault begins in mid throw, {START:g} s after the first pose, of a policy that"
-            " never releases, but where the release itself is what fails; times count from the"
-            " first pose that the fault spoiled, from when it happened, from the latch, or from"
-            " the first tick of the throw"
+            f"each fault begins in mid-throw, {START:g} s after the first pose, with a policy that"
+            " never releases, unless the release itself fails; times count from the first pose"
+            " that the fault affects, from the fault's action, from the latch, or from the first"
+            " tick of the throw"
         ),
         (
             "a breach is a command that is not finite or beyond the limits of training, or a"
-            " release that was not armed, was outside of the fence or came twice, as seen by the"
-            " vehicle"
+            " release that was not armed, was outside of the fence or was sent twice, as received"
+            " by the vehicle"
         ),
     )
     if args.speed < 1.0:

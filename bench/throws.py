@@ -217,8 +217,8 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
     met = errors[:, 0].mean() <= MEAN and upper < RATIO and len(good) == len(pairs)
     notes = (
         (
-            f"ratio of the mean errors {ratio:.3f}, 90 % upper bound {upper:.3f} (pairs drawn"
-            f" anew); bars: mean within {MEAN:.2f} m, bound under {RATIO}:"
+            f"ratio of the mean errors {ratio:.3f}, 90 % upper bound {upper:.3f} (bootstrap"
+            f" of pairs); bars: mean within {MEAN:.2f} m, bound under {RATIO}:"
             f" {'met' if met else 'NOT met'}"
         ),
         (

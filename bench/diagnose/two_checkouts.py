@@ -411,7 +411,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     ask.add_argument("--trees", nargs="+", required=True, help="checkouts: old, new; or new alone")
     ask.add_argument("--banks", nargs="*", default=[], help="files of arguments of sealed")
     ask.add_argument("--foreign", nargs="*", default=[], help="lists of seeds of foreign")
-    ask.add_argument("--skip", nargs="*", type=int, default=[], help="seeds seen in development")
+    ask.add_argument("--skip", nargs="*", type=int, default=[], help="seeds used in development")
     ask.add_argument("--longest", nargs="*", default=[], help="kinds of worlds that begin first")
     ask.add_argument("--jobs", type=int, default=2)
     ask.add_argument("--worlds", type=int, help="so many of them alone")
