@@ -174,40 +174,71 @@ def calibrate_from_boards(
     Returns:
         The fisheye and the residuals, for all views and for each.
     """
-    import cv2
-
     (height, width), boards = find_boards(images, board)
-    numbers = [i for i, view in enumerate(boards) if view is not None]
+    views = {i: view for i, view in enumerate(boards) if view is not None}
     left_out: dict[int, str] = {}
     while True:
-        used = [i for i in numbers if i not in left_out]
+        used = [i for i in views if i not in left_out]
         if len(used) < DETECTED_AT_LEAST:
             raise ValueError(
                 f"no fisheye fits the boards of {DETECTED_AT_LEAST} pictures; left out: "
                 + "; ".join(f"picture {i + 1}: {why}" for i, why in left_out.items())
             )
-        views = [view for i in used if (view := boards[i]) is not None]
         try:
-            lens = _solve(views, width, height, fov_deg)
-            fisheye = Fisheye(lens)
-            residuals = [_residual(fisheye, view, board_pose(fisheye, view)) for view in views]
-        except (cv2.error, ValueError) as error:
-            worst, reach = _farthest(views, width, height)
-            reason = str(error).strip().splitlines()[-1]
-            left_out[used[worst]] = (
-                f"reaches {reach:.0f} px from the image's centre, and OpenCV's model, which"
-                f" ends 90 deg off the axis, cannot be fitted with it ({reason})"
-            )
-            continue
-        sizes = [float(np.sqrt(2.0 * np.mean(residual**2))) for residual in residuals]
-        usual = float(np.median(sizes))
-        worst = int(np.argmax(sizes))
-        if sizes[worst] <= WRONG_BOARD * usual:
+            lens, residuals = _fit([views[i] for i in used], width, height, fov_deg)
             break
-        left_out[used[worst]] = f"is {sizes[worst]:.2f} px off, the others {usual:.2f} px"
+        except _MisfitError as misfit:
+            left_out[used[misfit.board]] = str(misfit)
+    # A wrong board spoils the first fits, and a good one may have been left out in its place: each
+    # is tried again.
+    for number in list(left_out):
+        more = sorted([*used, number])
+        try:
+            lens, residuals = _fit([views[i] for i in more], width, height, fov_deg)
+        except _MisfitError:
+            continue
+        used = more
+        del left_out[number]
     estimates = dict(zip(used, residuals))
     report = _report([estimates.get(i) for i in range(len(boards))])
     return replace(lens, fov_deg=fov_deg), replace(report, left_out=left_out)
+
+
+class _MisfitError(Exception):
+    """Says why no lens fits all boards; ``board`` is the one to leave out."""
+
+    def __init__(self, board: int, reason: str):
+        super().__init__(reason)
+        self.board = board
+
+
+def _fit(
+    views: list[View], width: int, height: int, fov_deg: float
+) -> tuple[FisheyeParams, list[ndarray]]:
+    """Fit a lens to boards; returns it, and the residuals of each board [px], shape (2 N,).
+
+    Raises _MisfitError: OpenCV's model cannot be fitted, or a board fits far worse than the others.
+    """
+    import cv2
+
+    try:
+        lens = _solve(views, width, height, fov_deg)
+        fisheye = Fisheye(lens)
+        residuals = [_residual(fisheye, view, board_pose(fisheye, view)) for view in views]
+    except (cv2.error, ValueError) as error:
+        farthest, reach = _farthest(views, width, height)
+        reason = str(error).strip().splitlines()[-1]
+        raise _MisfitError(
+            farthest,
+            f"reaches {reach:.0f} px from the image's centre, and OpenCV's model, which ends 90 deg"
+            f" off the axis, cannot be fitted with it ({reason})",
+        ) from error
+    sizes = [float(np.sqrt(2.0 * np.mean(residual**2))) for residual in residuals]
+    usual = float(np.median(sizes))
+    worst = int(np.argmax(sizes))
+    if sizes[worst] > WRONG_BOARD * usual:
+        raise _MisfitError(worst, f"is {sizes[worst]:.2f} px off, the others {usual:.2f} px")
+    return lens, residuals
 
 
 def _farthest(views: list[View], width: int, height: int) -> tuple[int, float]:
