@@ -5,6 +5,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.toml_text import tables_beside
 from visthrow.logs.readers.table_to_log import Table
@@ -28,7 +29,7 @@ class Group:
 
     stem: str  # that their names share
     columns: tuple[str, ...]
-    values: np.ndarray  # shape (T, number of columns)
+    values: ndarray  # shape (T, number of columns)
     unit: str = ""  # by their names, "" where these do not say
 
     @property
@@ -114,7 +115,7 @@ def _last_unit(words: str) -> str:
     return NAMES["units"].get(last, "") if before else ""
 
 
-def moves(values: np.ndarray) -> bool:
+def moves(values: ndarray) -> bool:
     """Tell whether rows of numbers, shape (T, columns), differ."""
     whole = values[np.all(np.isfinite(values), axis=1)]
     return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))

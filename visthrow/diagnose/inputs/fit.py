@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import VehicleParams, changed
 from visthrow import config
@@ -48,8 +49,8 @@ class FitResult:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    theta: np.ndarray  # in the effects' units, shape (K,)
-    covariance: np.ndarray  # shape (K, K)
+    theta: ndarray  # in the effects' units, shape (K,)
+    covariance: ndarray  # shape (K, K)
     identified: tuple[bool, ...]  # by the logs, not the prior
     rms_before: Mapping[str, float]  # residual by channel, in its unit
     rms_after: Mapping[str, float]

@@ -10,6 +10,7 @@ import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, moves, unit_by_name
@@ -124,7 +125,7 @@ def _tables(numbers: Table) -> dict[str, Table]:
 
 def _clock(
     numbers: Table, proposal: MappingProposal, stated_unit: str | None
-) -> tuple[TimeColumn, np.ndarray]:
+) -> tuple[TimeColumn, ndarray]:
     """The column of stamps and its unit, or evenly spaced rows."""
     rising = [name for name, cells in numbers.items() if rises(cells)]
     named = [name for name in rising if PATTERNS["time"].search(name)]
@@ -268,7 +269,7 @@ def _carried_mass(log: FlightLog) -> float | None:
     return usual / physics.GRAVITY if usual > 0.0 else None
 
 
-def _usual(total: np.ndarray) -> float:
+def _usual(total: ndarray) -> float:
     """Middle of a thrust while it flies."""
     return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 

@@ -5,6 +5,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.common.rotations import matrix_of_quat, rotate_back, tilt_deg
@@ -59,7 +60,7 @@ class Path:
 
     group: Group
     unit: str
-    pos_w: np.ndarray  # shape (T, 3)
+    pos_w: ndarray  # shape (T, 3)
     why: str
 
     @property
@@ -70,7 +71,7 @@ class Path:
         return "mocap_pos_w" if self.group.matches("capture") else "pos_w"
 
 
-def rises(cells: np.ndarray) -> bool:
+def rises(cells: ndarray) -> bool:
     """Tell whether a column rises as a clock does."""
     steps = np.diff(cells[np.isfinite(cells)])
     return len(steps) > 10 and bool(np.all(steps >= 0.0)) and np.mean(steps > 0.0) > 0.3
@@ -84,7 +85,7 @@ class Recognition:
         why: Reasons, by channel.
     """
 
-    def __init__(self, time: np.ndarray, groups: list[Group], settings: dict[str, str]) -> None:
+    def __init__(self, time: ndarray, groups: list[Group], settings: dict[str, str]) -> None:
         """Take the groups that move, at stamps [s]; ``settings`` stand above a table's numbers."""
         self.time = time
         self.settings = settings
@@ -564,13 +565,13 @@ def _has_letters(group: Group) -> bool:
     return any("w" in split_unit(column)[0].lower()[-3:] for column in group.columns)
 
 
-def _normalise(values: np.ndarray) -> np.ndarray:
+def _normalise(values: ndarray) -> ndarray:
     """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
     centred = (values - np.mean(values, axis=0)).ravel()
     return centred / max(np.linalg.norm(centred), 1e-300)
 
 
-def _interpolate(samples: Samples, grid: np.ndarray) -> np.ndarray:
+def _interpolate(samples: Samples, grid: ndarray) -> ndarray:
     """Return a group's values at times of a grid, zeros where too few are known."""
     if len(samples.time) < 100:
         return np.zeros((len(grid), 3))

@@ -8,6 +8,7 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
@@ -93,7 +94,7 @@ NO_LEAN = Lean(0.0, 0.0, 0.0)
 
 
 def readings(
-    time: np.ndarray, path: np.ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
+    time: ndarray, path: ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
 ) -> list[PathReading]:
     """Weigh all readings of a path, the likeliest first.
 
@@ -142,7 +143,7 @@ def readings(
     return sorted(listed, key=lambda reading: reading.doubt)
 
 
-def _weigh_by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> Lean:
+def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
     """Weigh a path against the lean that an attitude gives it."""
     attitudes = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
@@ -169,12 +170,12 @@ def _huber(deviations: float) -> float:
     return near * (abs(deviations) - 0.5 * near)
 
 
-def turn_to(axes: str) -> np.ndarray:
+def turn_to(axes: str) -> ndarray:
     """Return the matrix that turns rows about a source's axes into ours."""
     return turn_of(axes or OURS).T
 
 
-def by_fall(time: np.ndarray, path: np.ndarray) -> str:
+def by_fall(time: ndarray, path: ndarray) -> str:
     """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
     level; "" where none does.
     """
@@ -206,7 +207,7 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
     return unit if miss < MASS_BAD else ""
 
 
-def rising(time: np.ndarray, path: np.ndarray) -> Samples:
+def rising(time: ndarray, path: ndarray) -> Samples:
     """Rows that are numbers and leave the clock going on."""
     rows = forward_rows(np.where(np.all(np.isfinite(path), axis=1), time, np.nan))
     return Samples(time[rows], path[rows])

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 from scipy.optimize import differential_evolution
 from scipy.stats import qmc
 
@@ -78,11 +79,11 @@ class Limits:
         if not (smallest > 0.0 and self.highest > self.lowest > 0.0):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
-    def hold(self, path: np.ndarray) -> bool:
+    def hold(self, path: ndarray) -> bool:
         """Tell whether a path keeps within them; its rows are ``PERIOD`` apart, shape (N, 3)."""
         return bool(np.all(_extremes(path) <= self._most + ROUNDING))
 
-    def share(self, path: np.ndarray, added: np.ndarray) -> float:
+    def share(self, path: ndarray, added: ndarray) -> float:
         """Largest share of a further way, 1 at most, with which a path keeps within them."""
         if self.hold(path + added):
             return 1.0
@@ -93,18 +94,18 @@ class Limits:
                 share = further
         return share
 
-    def around(self, path: np.ndarray) -> "Limits":
+    def around(self, path: ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""
         x, y, depth, highest, *motion = np.maximum(self._most, _extremes(path)).tolist()
         return Limits((x, y), -depth, highest, *motion, self.rate, self.thrust)
 
     @property
-    def _most(self) -> np.ndarray:
+    def _most(self) -> ndarray:
         """Return the limits in the order of :func:`_extremes`."""
         return np.array([*self.half, -self.lowest, self.highest, self.speed, self.acceleration])
 
 
-def _extremes(path: np.ndarray) -> np.ndarray:
+def _extremes(path: ndarray) -> ndarray:
     """Return how far a path goes from the hall's middle along x and y, down and up [m], its speed
     [m/s] and acceleration [m/s^2], shape (6,).
     """
@@ -118,13 +119,13 @@ def _extremes(path: np.ndarray) -> np.ndarray:
 
 
 def sweep(
-    t: np.ndarray,
+    t: ndarray,
     seconds: float,
     low: float,
     high: float,
-    limit: Callable[[np.ndarray], np.ndarray] = np.ones_like,
+    limit: Callable[[ndarray], ndarray] = np.ones_like,
     phase: float = 0.0,
-) -> np.ndarray:
+) -> ndarray:
     """Return a sine that runs from one frequency to another over a time and fades in and out, shape
     (N,).
 
@@ -165,7 +166,7 @@ NUMBERS = (
 START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the manoeuvre as it is
 
 
-def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
+def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
     """Lay the sweeps of a vector of :data:`NUMBERS` over a manoeuvre."""
     x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0).tolist()))
     kept = x["kept"]
@@ -175,8 +176,8 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     half_height = 0.5 * (limits.highest - limits.lowest)
     reaches = dict(zip("xyz", (*limits.half, half_height)))
 
-    def swept(axis: str) -> np.ndarray:
-        def farthest(frequency: np.ndarray) -> np.ndarray:
+    def swept(axis: str) -> ndarray:
+        def farthest(frequency: ndarray) -> ndarray:
             turned = 2.0 * np.pi * frequency
             if axis == "yaw":
                 return np.minimum(np.pi, YAW_RATE / turned)
@@ -216,8 +217,8 @@ class Design:
     base: Manoeuvre
     simulate: Simulate
     limits: Limits
-    numbers: np.ndarray | None = None  # of the best; None where none can be flown
-    information: np.ndarray | None = None  # of the best
+    numbers: ndarray | None = None  # of the best; None where none can be flown
+    information: ndarray | None = None  # of the best
     rate: float = -np.inf  # expected nats a second of the best
     start: float = np.nan  # the same of the manoeuvre that it began with
     flights: int = 0  # simulated
@@ -238,7 +239,7 @@ class Design:
             "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
         }
 
-    def costs(self, columns: np.ndarray) -> np.ndarray:
+    def costs(self, columns: ndarray) -> ndarray:
         """Less for more expected nats a second; of what would be aborted, more than of all others
         and the more the nearer to a crash.
 
@@ -248,7 +249,7 @@ class Design:
         simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])
         return np.array([self._cost(x, s) for x, s in zip(columns.T, simulated)])
 
-    def _cost(self, x: np.ndarray, simulated: Simulated) -> float:
+    def _cost(self, x: ndarray, simulated: Simulated) -> float:
         if simulated.model is None:
             return ABORTED * simulated.used
         information = self.aim.information(simulated.model)
@@ -281,7 +282,7 @@ def optimise(
     design = Design(aim, base, simulate, limits)
     design.start = -float(design.costs(START[:, None])[0])
 
-    def generation(columns: np.ndarray) -> np.ndarray:
+    def generation(columns: ndarray) -> ndarray:
         costs = design.costs(columns)
         flown = design.numbers is not None
         best = f"{design.rate:.3g} nats a second" if flown else "nothing that can be flown"

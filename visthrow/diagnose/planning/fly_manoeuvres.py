@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
+from numpy import ndarray
 
 from sim.effects.effect import apply
 from sim.params import PlantParams, changed
@@ -196,12 +197,12 @@ class SimulatedFlight:
 
     manoeuvre: Manoeuvre
     plant: PlantParams
-    truth: Mapping[str, np.ndarray]
-    commands: np.ndarray  # [N, rad/s], shape (rows of the reference, 4)
+    truth: Mapping[str, ndarray]
+    commands: ndarray  # [N, rad/s], shape (rows of the reference, 4)
     rng: np.random.Generator
 
     @property
-    def time(self) -> np.ndarray:
+    def time(self) -> ndarray:
         """Return the times of the samples [s]."""
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
@@ -216,7 +217,7 @@ class SimulatedFlight:
             return Simulated(None, used)
 
     @property
-    def origin_w(self) -> np.ndarray:
+    def origin_w(self) -> ndarray:
         """Position of the body frame's origin [m], shape (N, 3): motion capture reports it, while
         the simulator moves the centre of mass.
         """
@@ -306,7 +307,7 @@ class SimulatedFlight:
         return _channels(stamps, {params.input: command_of(params.thrust_map, lagged)})
 
 
-def _channels(time: np.ndarray, values: Mapping[str, np.ndarray]) -> dict[str, Channel]:
+def _channels(time: ndarray, values: Mapping[str, ndarray]) -> dict[str, Channel]:
     """Return channels of names in :data:`LOGGED` that share their stamps [s]."""
     return {name: Channel(time, array, *LOGGED[name]) for name, array in values.items()}
 
@@ -373,7 +374,7 @@ def fly(
     return flights
 
 
-def _stack(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
+def _stack(manoeuvres: Sequence[Manoeuvre], name: str) -> ndarray:
     """Return rows of manoeuvres side by side, each at its last one from its end on."""
     columns = [getattr(m, name) for m in manoeuvres]
     rows = np.arange(max(map(len, columns)))

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.common.toml_text import tables_beside
@@ -30,20 +31,20 @@ class Manoeuvre:
     name: str
     purpose: str
     seconds: float  # with SETTLE at both ends
-    pos_w: np.ndarray  # [m], shape (N, 3)
-    yaw: np.ndarray  # [rad], shape (N,)
-    rates_b: np.ndarray  # added to the commanded body rates [rad/s], shape (N, 3)
-    thrust_factor: np.ndarray  # on the commanded thrust, shape (N,)
-    release: np.ndarray  # bool, shape (N,)
+    pos_w: ndarray  # [m], shape (N, 3)
+    yaw: ndarray  # [rad], shape (N,)
+    rates_b: ndarray  # added to the commanded body rates [rad/s], shape (N, 3)
+    thrust_factor: ndarray  # on the commanded thrust, shape (N,)
+    release: ndarray  # bool, shape (N,)
     payload: bool = True
 
     @property
-    def time(self) -> np.ndarray:
+    def time(self) -> ndarray:
         """Times of the rows [s], shape (N,)."""
         return times_of(self.seconds)
 
     @cached_property
-    def vel_w(self) -> np.ndarray:
+    def vel_w(self) -> ndarray:
         """[m/s], shape (N, 3)."""
         return np.gradient(self.pos_w, PERIOD, axis=0)
 
@@ -82,30 +83,30 @@ class Manoeuvre:
         return "\n".join(lines) + "\n"
 
 
-def times_of(seconds: float) -> np.ndarray:
+def times_of(seconds: float) -> ndarray:
     """Return the times of a manoeuvre's rows [s]."""
     return np.arange(0.0, seconds - 0.5 * PERIOD, PERIOD)
 
 
-def moving_times(seconds: float) -> np.ndarray:
+def moving_times(seconds: float) -> ndarray:
     """Return the times after SETTLE of a manoeuvre's rows [s], those in the hover before and after
     at the ends of its motion.
     """
     return np.clip(times_of(seconds) - SETTLE, 0.0, seconds - 2.0 * SETTLE)
 
 
-def _share(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+def _share(t: ndarray, begin: float, length: float) -> ndarray:
     """Return the share of a stretch that is over, 0 to 1."""
     return np.clip((t - begin) / length, 0.0, 1.0)
 
 
-def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+def rise(t: ndarray, begin: float, length: float) -> ndarray:
     """Return a rise from 0 to 1 with speed and acceleration 0 at both ends."""
     s = _share(t, begin, length)
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
 
 
-def _doublets(t: np.ndarray) -> np.ndarray:
+def _doublets(t: ndarray) -> ndarray:
     """Rates of 3 rad/s about roll, pitch and yaw in turn, every 0.8 s, 0.08 s there and back."""
     out = np.zeros((len(t), 3))
     number, phase = np.divmod(t, 0.8)
@@ -114,28 +115,28 @@ def _doublets(t: np.ndarray) -> np.ndarray:
     return out
 
 
-def _pulse(phase: np.ndarray, width: float) -> np.ndarray:
+def _pulse(phase: ndarray, width: float) -> ndarray:
     """Return 1 for a time and -1 for as long after it, then 0."""
     forth = phase < width
     back = (phase >= width) & (phase < 2.0 * width)
     return 1.0 * forth - back
 
 
-def _steps(t: np.ndarray) -> np.ndarray:
+def _steps(t: ndarray) -> ndarray:
     """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the
     height back.
     """
     return 1.0 + 0.4 * _pulse(np.mod(t, 1.5), 0.15)
 
 
-def _integrate_rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+def _integrate_rise(t: ndarray, begin: float, length: float) -> ndarray:
     """Integral of :func:`rise` over time."""
     s = _share(t, begin, length)
     after = np.maximum(t - begin - length, 0.0)
     return length * s**4 * (2.5 + s * (-3.0 + s)) + after
 
 
-def _stop(t: np.ndarray) -> np.ndarray:
+def _stop(t: ndarray) -> ndarray:
     """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope
     stays taut.
     """
@@ -144,18 +145,18 @@ def _stop(t: np.ndarray) -> np.ndarray:
     return velocity - distance * rise(t, 3.9, 2.5) - 0.5 * distance
 
 
-def _sine(t: np.ndarray) -> np.ndarray:
+def _sine(t: ndarray) -> ndarray:
     """Height that swings by 0.25 m at 0.8 Hz, begun and ended within a second."""
     grown = rise(t, 0.0, 1.0) * (1.0 - rise(t, 5.0, 1.0))
     return HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * grown
 
 
-def _round(t: np.ndarray) -> np.ndarray:
+def _round(t: ndarray) -> ndarray:
     """Angle of two turns in eight seconds."""
     return 4.0 * np.pi * rise(t, 0.0, 8.0)
 
 
-SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+SHAPES: dict[str, Callable[[ndarray], ndarray]] = {
     "sine": _sine,
     "stop": _stop,
     "cosine": lambda t: np.cos(_round(t)),
@@ -166,7 +167,7 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 """What the table of manoeuvres names."""
 
 
-def _along(shape: Any, t: np.ndarray) -> np.ndarray:
+def _along(shape: Any, t: ndarray) -> ndarray:
     """Return values at times [s] of a named shape, or of a value and its rises, each with its size,
     its begin and its length [s].
     """

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
@@ -80,13 +81,13 @@ class PlanningGoal:
         ]
         self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
-    def information(self, model: Model) -> np.ndarray:
+    def information(self, model: Model) -> ndarray:
         """Expected information of one simulated flight."""
         return expected_information(
             model, self.diagnosis.theta, self.base.noise, self.names, self.priors
         )
 
-    def nats(self, new: np.ndarray) -> float:
+    def nats(self, new: ndarray) -> float:
         """Expected nats between the members of the pair that is hardest, or the mean logarithm by
         which deviations shrink.
         """
@@ -94,7 +95,7 @@ class PlanningGoal:
             return min(self._gap(pair, new) for pair in self.pairs)
         return np.mean(np.log(self._deviations(0.0 * new) / self._deviations(new)))
 
-    def settled(self, new: np.ndarray) -> tuple[list[tuple[int, ...]], int]:
+    def settled(self, new: ndarray) -> tuple[list[tuple[int, ...]], int]:
         """Pairs apart, or effects that can be named, after the fewest flights that settle the most;
         and the number of these.
         """
@@ -107,11 +108,11 @@ class PlanningGoal:
                 repeats = count
         return most, repeats
 
-    def _apart(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
+    def _apart(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
         """Return the pairs that so many flights separate."""
         return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
 
-    def _named(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
+    def _named(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
         """Return the effects that so many flights measure well enough to name."""
         able = self.priors.slab[self.vague] * NAMEABLE
         unknown = self._deviations(0.0 * new) > able
@@ -123,7 +124,7 @@ class PlanningGoal:
         confirmed = count_telling(promised) >= FEWEST
         return [(j,) for j in np.compress(unknown & known & confirmed, self.vague).tolist()]
 
-    def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
+    def _gap(self, pair: tuple[int, int], new: ndarray) -> float:
         """Expected nats between two members after the new flight, with either as the truth; the
         smaller one.
 
@@ -146,7 +147,7 @@ class PlanningGoal:
             gaps.append(right - wrong)
         return min(gaps)
 
-    def _deviations(self, new: np.ndarray) -> np.ndarray:
+    def _deviations(self, new: ndarray) -> ndarray:
         """Posterior deviation of each effect that is planned for, if it were named, with more
         information.
         """
@@ -158,7 +159,7 @@ class PlanningGoal:
             deviations.append(np.sqrt(variance))
         return np.array(deviations)
 
-    def measurements(self) -> list[tuple[Measurement, np.ndarray]]:
+    def measurements(self) -> list[tuple[Measurement, ndarray]]:
         """Return the measurements on the ground of members of classes, with the information of
         each.
         """
@@ -171,7 +172,7 @@ class PlanningGoal:
                 promised.append((m, information))
         return promised
 
-    def proposal(self, flight: Manoeuvre | Measurement, new: np.ndarray) -> FlightProposal:
+    def proposal(self, flight: Manoeuvre | Measurement, new: ndarray) -> FlightProposal:
         """Return the promise of a manoeuvre, or of a measurement, of this information."""
         separated, repeats = self.settled(new)
         separates = []
@@ -190,7 +191,7 @@ class PlanningGoal:
 
 
 def propose(
-    aim: PlanningGoal, informed: Sequence[tuple[Manoeuvre, np.ndarray]]
+    aim: PlanningGoal, informed: Sequence[tuple[Manoeuvre, ndarray]]
 ) -> list[FlightProposal]:
     """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
     the expected information of each.
@@ -238,7 +239,7 @@ def _expect_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], floa
 
 def expected_information(
     model: Model, theta: Mapping[str, float], noise: Noise, names: Sequence[str], priors: Priors
-) -> np.ndarray:
+) -> ndarray:
     """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0
     for what they hide.
     """

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from scipy.linalg import solve_triangular
 
 from visthrow.common.rotations import matrix_of_quat, rotate_back
@@ -26,7 +27,7 @@ REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
 """
 
 
-def _inputs(window: Window) -> np.ndarray:
+def _inputs(window: Window) -> ndarray:
     """Body velocity, body rates and thrust at the knots, as far as they are known, shape (k, I)."""
     knots = dict(window.knots)
     count = len(knots.get("time", ()))
@@ -40,18 +41,18 @@ def _inputs(window: Window) -> np.ndarray:
 class ForceTable:
     """A force table: ``force_b = weights' radial(inputs)``; torques likewise."""
 
-    mean: np.ndarray  # of the inputs, shape (I,)
-    deviation: np.ndarray
-    centres: np.ndarray  # in deviations, shape (M, I)
+    mean: ndarray  # of the inputs, shape (I,)
+    deviation: ndarray
+    centres: ndarray  # in deviations, shape (M, I)
     blocks: tuple[str, ...]
 
-    def radial(self, inputs: np.ndarray) -> np.ndarray:
+    def radial(self, inputs: ndarray) -> ndarray:
         """Basis functions: constant, linear, radial; shape (k, 1 + I + M)."""
         z = (inputs - self.mean) / self.deviation
         distance = ((z[:, None, :] - self.centres) ** 2).sum(-1)
         return np.hstack((np.ones((len(z), 1)), z, np.exp(-0.5 * distance / WIDTH**2)))
 
-    def columns(self, window: Window) -> np.ndarray:
+    def columns(self, window: Window) -> ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
         basis = self.radial(_inputs(window))
         values = laws.KnotValues(window.knots)
@@ -86,12 +87,12 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
 class Trained:
     """Information of the table's weights by group of windows."""
 
-    groups: np.ndarray
-    information: np.ndarray  # shape (F, W, W)
-    score: np.ndarray  # shape (F, W)
-    reach: np.ndarray  # prior deviation of each weight at reach 1, shape (W,)
+    groups: ndarray
+    information: ndarray  # shape (F, W, W)
+    score: ndarray  # shape (F, W)
+    reach: ndarray  # prior deviation of each weight at reach 1, shape (W,)
 
-    def weights(self, keep: np.ndarray) -> np.ndarray:
+    def weights(self, keep: ndarray) -> ndarray:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
         information = self.information[keep].sum(0)
         score = self.score[keep].sum(0)
@@ -109,7 +110,7 @@ class Trained:
 
 
 def train(
-    point: Point, table: ForceTable, groups: Sequence[int], theta: np.ndarray | None = None
+    point: Point, table: ForceTable, groups: Sequence[int], theta: ndarray | None = None
 ) -> Trained:
     """Gather what the windows say about the table's weights.
 

@@ -6,6 +6,7 @@ flight, every effect somewhere within its floor, plus the score of the hidden ef
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import STRONG, Posterior
 from visthrow.diagnose.select.result import Diagnosis
@@ -62,13 +63,13 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     shape = draws, len(effects)
 
-    def worlds() -> np.ndarray:
+    def worlds() -> ndarray:
         small = rng.uniform(-1.0, 1.0, shape) @ information
         if parametric:
             return small + rng.standard_normal(shape) @ root.T
         return small + rng.choice((-1.0, 1.0), (draws, len(score_of))) @ score_of
 
-    def named(score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def named(score: ndarray) -> tuple[ndarray, ndarray]:
         gain = Posterior(information, score, priors).additions(())
         return gain, gain.max(axis=1) > diagnosis.threshold
 
@@ -96,7 +97,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     return Blind(tuple(curves), alarms.mean(), 10 * draws, source)
 
 
-def _limit(size: np.ndarray, share: np.ndarray) -> float:
+def _limit(size: ndarray, share: ndarray) -> float:
     """Size from which on the share stays at or above NAMED, interpolated in the logarithm of the
     size.
     """

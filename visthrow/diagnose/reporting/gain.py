@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
@@ -185,7 +186,7 @@ def on_others(
 
 def _sum_weighted_squares(
     windows: Sequence[Window], problem: Problem, noise: Noise
-) -> tuple[np.ndarray, int]:
+) -> tuple[ndarray, int]:
     """Return sums over the samples ahead of squared errors, of those expected of noise, and of
     weights, shape (3, C), where samples far outside weigh less; and the number of these.
     """
@@ -207,7 +208,7 @@ def _sum_weighted_squares(
     return sums, outliers
 
 
-def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> np.ndarray | None:
+def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> ndarray | None:
     """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be
     trained.
     """

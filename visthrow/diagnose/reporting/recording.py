@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+from numpy import ndarray
 
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.reporting.pictures import left_over
@@ -65,12 +66,12 @@ def _channel(
     _path(stream, f"{home}/{name}/after", stamps, place - new, style.AFTER)
 
 
-def _send(stream, entity: str, time: np.ndarray, columns) -> None:
+def _send(stream, entity: str, time: ndarray, columns) -> None:
     """Send columns that have a row for each time [s]."""
     stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time)], columns)
 
 
-def _path(stream, entity: str, time: np.ndarray, points: np.ndarray, colour: str) -> None:
+def _path(stream, entity: str, time: ndarray, points: ndarray, colour: str) -> None:
     points = points.astype(np.float32)
     look = {"colors": [colour_code(colour)]}
     stream.log(entity, rr.Points3D.from_fields(radii=0.006, **look), static=True)
