@@ -359,7 +359,7 @@ def test_the_table_takes_up_what_no_name_explains():
     table = table_of(point, default_rng(0))
     flights = [w.flight for w in point.windows]
     trained = train(point, table, flights)
-    weights = trained.weights(trained.groups != 5)
+    weights = trained.weights(trained.statistics.flights != 5)
     index = next(i for i, w in enumerate(point.windows) if w.flight == 5 and w.phase == "throw")
     window = point.windows[index]
     asked = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T

@@ -10,15 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
-from scipy.linalg import solve_triangular
 
 from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.integrals import Integrals
-from visthrow.diagnose.likelihood.marginal import with_latent_effects
+from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import Point, statistics_of
+from visthrow.diagnose.select.terms import strongest_forces
 
 CENTRES = 20
 WIDTH = 1.5  # width of a radial function, in deviations of the inputs
@@ -85,17 +84,17 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
 
 @dataclass(frozen=True)
 class Trained:
-    """Information of the table's weights by group of windows."""
+    """What groups of windows say of the table's W weights."""
 
-    groups: ndarray
-    information: ndarray  # shape (F, W, W)
-    score: ndarray  # shape (F, W)
+    statistics: Statistics  # of the effects, and behind them of the weights
     reach: ndarray  # prior deviation of each weight at reach 1, shape (W,)
 
     def weights(self, keep: ndarray) -> ndarray:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
-        information = self.information[keep].sum(0)
-        score = self.score[keep].sum(0)
+        known = self.statistics.only(keep)
+        behind = slice(-len(self.reach), None)
+        information = known.information.sum(0)[behind, behind]
+        score = known.score.sum(0)[behind]
         mean = np.zeros(len(self.reach))
         likeliest = -np.inf
         for reach in REACHES:
@@ -116,27 +115,15 @@ def train(
 
     ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
     shape (K,); default 0."""
-    names, row = np.unique(groups, return_inverse=True)
-    size = table.columns(point.windows[0]).shape[1]
-    information = np.zeros((len(names), size, size))
-    score = np.zeros((len(names), size))
-    grams = [with_latent_effects(gram) for gram in point.grams]
-    parts = Integrals(grams, point.noise).statistics(grams, point.theta)
-    count = len(point.theta)
-    sizes = np.zeros(len(parts.theta))
-    sizes[:count] = 0.0 if theta is None else theta
-    parts = parts.about(sizes)
-    for w, (window, f) in enumerate(zip(point.windows, row)):
-        columns = solve_triangular(point.grams[w].factor, table.columns(window), lower=True)
-        latents = slice(count, count + len(columns))
-        information[f] += columns.T @ parts.information[w, latents, latents] @ columns
-        score[f] += columns.T @ parts.score[w, latents]
-    strongest = dict.fromkeys(table.blocks, 0.0)
-    for (block, _), sd in point.noise.latent_sd.items():
-        name = LATENT_BLOCKS[block]
-        strongest[name] = max(strongest[name], sd)
-    reach = np.repeat(list(strongest.values()), size // len(table.blocks))
-    return Trained(names, information, score, reach)
+    columns = [w.latent @ table.columns(w) for w in point.windows]
+    statistics = statistics_of(point, point.windows, columns, range(len(columns)))
+    effects = len(point.theta)
+    sizes = np.zeros(len(statistics.theta))
+    sizes[:effects] = 0.0 if theta is None else theta
+    strongest = strongest_forces(point)
+    levels = [strongest[name] for name in table.blocks]
+    reach = np.repeat(levels, columns[0].shape[1] // len(levels))
+    return Trained(statistics.about(sizes).by(groups), reach)
 
 
 def unexplained(point: Point, seed: int) -> dict | None:

@@ -217,12 +217,13 @@ def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> ndarray |
     if table is None:
         return None
     trained = train(before, table, cross.groups)
-    weights = np.zeros((len(trained.groups), len(trained.reach)))
+    numbers = trained.statistics.flights
+    weights = np.zeros((len(numbers), len(trained.reach)))
     for fold in cross.folds:
         training = np.setdiff1d(np.arange(len(weights)), fold)
         weights[fold] = trained.weights(training) if len(training) else 0.0
     residuals = []
-    for window, size in zip(before.windows, weights[np.searchsorted(trained.groups, cross.groups)]):
+    for window, size in zip(before.windows, weights[np.searchsorted(numbers, cross.groups)]):
         force = table.columns(window) @ size
         residuals.append(window.residual - window.latent @ force)
     channels = len(work.problem.model.channels)

@@ -17,13 +17,10 @@ from numpy import ndarray
 from scipy.special import betaincinv
 
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.forms import predicted
-from visthrow.diagnose.likelihood.integrals import Integrals
-from visthrow.diagnose.likelihood.marginal import Statistics, correlated_of, grams_of
-from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import (
     COARSE,
     COMMAND,
@@ -33,7 +30,7 @@ from visthrow.diagnose.select.candidates import (
     integrated,
     judged,
 )
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import Point, statistics_of
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
 
@@ -42,32 +39,6 @@ EITHER = 0.5
 
 From half of it as a deviation 0 and 1 are told apart: half way is two from both.
 """
-
-
-def statistics_of(
-    point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Sequence[int]
-) -> Statistics:
-    """Return the statistics of windows, with those of T commands behind those of the effects;
-    windows of fewer commands have columns of 0.
-
-    Args:
-        point: whose noise levels are taken.
-        windows: with residuals at the point.
-        columns: of each window's commands, shape (N, T).
-        rows: numbers of the windows among the point's.
-    """
-    longest = max(changes.shape[1] for changes in columns)
-    wide = []
-    for window, changes in zip(windows, columns):
-        padded = np.zeros((len(window.residual), longest))
-        padded[: len(changes), : changes.shape[1]] = changes
-        wide.append(replace(window, effects=np.hstack((window.effects, padded))))
-    problem = point.problem
-    floors = np.append(problem.priors.floor, np.ones(longest))
-    grams = grams_of(wide, floors, len(problem.model.channels))
-    grams = correlated_of(grams, wide, point.noise.correlation_time)
-    noise = levels.only(point.noise, grams, rows)
-    return Integrals(grams, noise).statistics(grams, point.theta)
 
 
 def _evidence(

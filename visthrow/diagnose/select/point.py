@@ -26,6 +26,7 @@ from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
     Statistics,
+    correlated_of,
     grams_of,
     with_residuals,
 )
@@ -276,6 +277,32 @@ def _losing(window: Window, columns: ndarray, share: float) -> Window:
     nuisance = np.hstack((window.nuisance, columns))
     residual = window.residual - share * columns.sum(1)
     return replace(window, residual=residual, nuisance=nuisance, nuisance_sd=sd)
+
+
+def statistics_of(
+    point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Sequence[int]
+) -> Statistics:
+    """Return the statistics of windows, with those of T further columns behind those of the
+    effects; windows of fewer have columns of 0.
+
+    Args:
+        point: whose noise levels are taken.
+        windows: with residuals at the point.
+        columns: of each window, shape (N, T).
+        rows: numbers of the windows among the point's.
+    """
+    longest = max(changes.shape[1] for changes in columns)
+    wide = []
+    for window, changes in zip(windows, columns):
+        padded = np.zeros((len(window.residual), longest))
+        padded[: len(changes), : changes.shape[1]] = changes
+        wide.append(replace(window, effects=np.hstack((window.effects, padded))))
+    problem = point.problem
+    floors = np.append(problem.priors.floor, np.ones(longest))
+    grams = grams_of(wide, floors, len(problem.model.channels))
+    grams = correlated_of(grams, wide, point.noise.correlation_time)
+    noise = levels.only(point.noise, grams, rows)
+    return Integrals(grams, noise).statistics(grams, point.theta)
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
