@@ -171,7 +171,7 @@ class TestStand:
         speed = 1000.0
         assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == approx(1.7, rel=0.03)
         record = json.loads((out / "fit.json").read_text())
-        assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
+        assert np.shape(record["covariance"]) == (len(record["names"]),) * 2
         assert len(record["logs"]) == 3
 
 

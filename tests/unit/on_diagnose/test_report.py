@@ -287,7 +287,7 @@ def test_the_report_holds_sentences_pictures_and_numbers(
 def test_terms_that_act_together_are_printed_together(found):
     """A drag is the first explanation here by a pair; the second is one term alone."""
     first = result.Law(
-        "F = c v_xy² v", "vehicle force", ("speed_across_squared",), "vel", 4e-3, 1e-4, "kg", 20.0
+        "vehicle force", ("speed_across_squared",), "vel", 4e-3, "F = c v_xy² v", 1e-4, "kg", 20.0
     )
     second = replace(first, formula="F = c |v| v_xy v", coefficient=-8e-3)
     alone = replace(first, formula="F = c |v| v", coefficient=-2e-3)

@@ -144,47 +144,14 @@ class SavedDiagnosis:
             )
 
     def origin(self) -> list[str]:
-        """Lines on where it comes from."""
-        report = self.report
-        lines = [
-            f"Extended by `visthrow diagnose apply` from {self.path}:"
-            f" {report.get('overall', 'a diagnosis')}.",
-            f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
-            f" {report.get('samples', 0)} samples.",
-        ]
-        provenance = report.get("provenance") or {}
+        """Lines on where it comes from, and what ``explain`` printed."""
+        lines = [f"Extended by `visthrow diagnose apply` from {self.path}."]
+        provenance = self.report.get("provenance") or {}
         for name in ("commit", "time", "command"):
             if provenance.get(name):
                 lines.append(f"{name}: {provenance[name]}")
-        theta = report.get("theta", {})
-        gain = report.get("gain") or {}
-        for c in gain.get("channels", ()) if theta else ():
-            lines.append(
-                f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
-                f" {c.get('after', 0.0):.3g} after."
-            )
-        if landing := gain.get("landing"):
-            lines.append(
-                f"Landing error of {landing['throws']} throws: {landing['before']:.3g} m before,"
-                f" {landing['after']:.3g} m after."
-            )
-        sizes = []
-        for f in report.get("findings") or []:
-            if f["name"] in theta and f.get("low") is not None:
-                sizes.append(
-                    f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
-                    f" {f['high']:.3g})."
-                )
-        if sizes:
-            lines.append(
-                "Sizes and intervals as `explain` printed them. The deviations below also allow for"
-                " differences between flights."
-            )
-        lines += sizes
-        for s in report.get("scatter") or []:
-            if s["found"]:
-                group = s.get("by", "flight")
-                lines.append(
-                    f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
-                )
-        return lines
+        return [
+            *lines,
+            *self.report.get("summary", ()),
+            "The deviations below also allow for differences between flights.",
+        ]

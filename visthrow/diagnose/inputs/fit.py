@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -120,8 +120,14 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     size = defaultdict(float, zip(result.names, map(float, result.theta)))
     if setup.flyer is not None:
         return _vehicle_of_flyer(setup.flyer, size, base)
-    if setup.stand is not None:
-        return _vehicle_of_stand(setup.stand, size, result.middle_speed, base)
+    if (stand := setup.stand) is not None:
+        values = {
+            "thrust.k_f": stand.k_f * (1.0 + size["thrust_gain"]),
+            "thrust.k_1": stand.k_f * size["thrust_linear"] * result.middle_speed,
+            "thrust.voltage_coefficient": size["thrust_voltage"],
+            "battery.reference_voltage": stand.reference_voltage,
+        }
+        return changed(base, values)
     raise DiagnoseError(
         f"'{setup.about}' is neither a vehicle nor a motor; use a setup with [flyer] or [stand]"
     )
@@ -158,18 +164,6 @@ def _vehicle_of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) ->
     return changed(base, values)
 
 
-def _vehicle_of_stand(
-    p: Any, size: Mapping[str, float], middle: float, base: VehicleParams
-) -> VehicleParams:
-    values = {
-        "thrust.k_f": p.k_f * (1.0 + size["thrust_gain"]),
-        "thrust.k_1": p.k_f * size["thrust_linear"] * middle,
-        "thrust.voltage_coefficient": size["thrust_voltage"],
-        "battery.reference_voltage": p.reference_voltage,
-    }
-    return changed(base, values)
-
-
 def write(
     folder: str | Path,
     name: str,
@@ -187,18 +181,7 @@ def write(
 
     folder = Path(folder)
     sources = {str(log.meta.get("source", "")): _digest(log) for log in logs}
-    record = {
-        "setup": name,
-        "effects": list(result.names),
-        "units": list(result.units),
-        "theta": result.theta.tolist(),
-        "covariance": result.covariance.tolist(),
-        "told_by_logs": list(result.identified),
-        "rms_before": dict(result.rms_before),
-        "rms_after": dict(result.rms_after),
-        "logs": sources,
-    }
-    write_json(folder / "fit.json", record)
+    write_json(folder / "fit.json", {"setup": name, "logs": sources, **asdict(result)})
     if setup.flyer is None and setup.stand is None:
         return [folder / "fit.json"]
     vehicle = vehicle_of(setup, result, base)

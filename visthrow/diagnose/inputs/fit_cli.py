@@ -3,6 +3,7 @@ flights or tests.
 """
 
 import argparse
+from dataclasses import asdict
 
 from visthrow.common.arguments import declare
 
@@ -41,8 +42,5 @@ def run(args: argparse.Namespace) -> int:
     for path in fitting.write(args.out, args.config, setup, result, logs, base):
         print(path)
     if args.json:
-        write_json(
-            args.json,
-            {"effects": list(result.names), "theta": result.theta, "covariance": result.covariance},
-        )
+        write_json(args.json, asdict(result))
     return 0

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
+from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.models.model_interface import Effect
 
 # deviations of a measurement beyond which the configured value cannot be off
@@ -36,20 +37,7 @@ class Measurement:
 
 RIGHT = 1e-3  # deviation of a value that is stated to be right, in what is negligible
 
-MEASUREMENTS = (
-    Measurement(
-        "weigh the vehicle", "mass_quad", 3e-4, 60.0
-    ),  # kitchen scale of 0.1 g, read thrice
-    Measurement("weigh the payload", "mass_payload", 2e-4, 60.0),  # the same
-    Measurement("weigh the rope", "rope_mass", 1e-4, 120.0),  # the same, taken off its mount
-    Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's centre
-    Measurement("gauge the payload", "payload_offset", 5e-4, 60.0),  # caliper
-    # still air by a thread beside the vehicle
-    Measurement("show that no air moves along x", "wind_x", 0.1, 60.0),
-    Measurement("show that no air moves along y", "wind_y", 0.1, 60.0),
-    Measurement("read a barometer", "air_density", 3e-3, 60.0),  # 1 hPa and 0.5 K
-    Measurement("tape between two markers", "frame_scale", 3e-4, 120.0),  # 1 mm in 3 m
-)
+MEASUREMENTS = tuple(Measurement(name, **row) for name, row in tables_beside(__file__).items())
 
 
 def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:

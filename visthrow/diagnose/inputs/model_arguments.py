@@ -9,7 +9,9 @@ from typing import Any
 
 from visthrow.common.arguments import declare
 from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
+from visthrow.diagnose.inputs import measures, setup
 from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes, diagnose
 from visthrow.diagnose.select.result import NAMED, Diagnosis
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, label
@@ -45,8 +47,6 @@ class Opened:
         """Read the logs.
 
         Raises ConfigError, LogError: as what is read."""
-        from visthrow.diagnose.inputs import setup
-
         self._args = args
         self.logs = setup.read_logs(args.logs, args.config)
 
@@ -56,8 +56,6 @@ class Opened:
 
         Raises ConfigError, LogError, DiagnoseError: as what is built; ``--set`` with a setup's own
         model."""
-        from visthrow.diagnose.inputs import measures, setup
-
         args = self._args
         logs = self.logs
         chosen = setup.load(args.config)
@@ -84,15 +82,11 @@ class Opened:
     @property
     def known(self) -> KnownVehicle:
         """Return what is known of the vehicle."""
-        from visthrow.diagnose.inputs import setup
-
         vehicle = setup.known(self._args.config)
         return replace(vehicle, unread=vehicle.unread.union(self._args.overrule))
 
     def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
         """Diagnose the flights, as the arguments say."""
-        from visthrow.diagnose.select.diagnose_flights import diagnose
-
         without = numbers(self._args.without, self.logs)
         if self._args.overrule:
             rows = [row for log in check(self.logs, self.known) for row in log.rows]
@@ -121,8 +115,6 @@ def made_with(args: argparse.Namespace) -> dict[str, Any]:
 
     ``apply`` builds on nothing else.
     """
-    from visthrow.diagnose.inputs import setup
-
     return {
         "model": setup.load(args.config).model or THROW,
         "plant": args.plant,
@@ -138,7 +130,6 @@ def throw_model(
     commands put right.
     """
     from visthrow.common.compute_device import resolve_for_warp
-    from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import load_experiment, plant_of
 

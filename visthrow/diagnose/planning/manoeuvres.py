@@ -8,6 +8,7 @@ Each stays within a box of a few metres and leaves the payload well below the ro
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -77,10 +78,9 @@ class Manoeuvre:
         )
         columns = (self.time, self.pos_w, self.vel_w, self.yaw, self.rates_b)
         rows = np.column_stack((*columns, self.thrust_factor, self.release))
-        lines = [header]
-        for row in rows:
-            lines.append(",".join(f"{value:.5g}" for value in row))
-        return "\n".join(lines) + "\n"
+        table = StringIO()
+        np.savetxt(table, rows, "%.5g", ",", header=header, comments="")
+        return table.getvalue()
 
 
 def times_of(seconds: float) -> ndarray:

@@ -163,8 +163,9 @@ def to_json(
     blind: Blind | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything the page says, as plain data."""
+    """Everything the page says, as plain data, and the lines of :func:`summary`."""
     value = diagnosis.to_dict()
+    value["summary"] = list(filter(None, summary(diagnosis, gain).splitlines()))
     for name, part in (("gain", gain), ("blind", blind)):
         if part is not None:
             value[name] = dataclasses.asdict(part)

@@ -25,7 +25,6 @@ from visthrow.diagnose.select.held_out import (
 )
 from visthrow.diagnose.select.point import Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
-from visthrow.diagnose.throw.landing import PredictedLandings
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def landing_gain(
     if trained:
         parts = [model.landings(trained[int(f)], [int(f)]) for f in plain.flights]
         columns = zip(*(vars(part).values() for part in parts))
-        held_landings = PredictedLandings(*map(np.concatenate, columns))
+        held_landings = type(plain)(*map(np.concatenate, columns))
     good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)
     if not good.any():
         return None

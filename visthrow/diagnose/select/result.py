@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import isnan
 from typing import Any
 
+from sim.params import LawParams
 from visthrow.diagnose.select.candidates import Scatter, unit_suffix
 from visthrow.diagnose.throw.command_mistakes import Mistake
 
@@ -116,15 +117,11 @@ class Level:
 
 
 @dataclass(frozen=True)
-class Law:
-    """A term outside the catalogue: coefficient times scalar factors times a vector."""
+class Law(LawParams):
+    """A law outside the catalogue, as it was found."""
 
     formula: str
-    block: str  # of visthrow.diagnose.models.law_terms.BLOCKS
-    factors: tuple[str, ...]  # keys of visthrow.diagnose.models.law_terms.SCALARS
-    vector: str  # key of visthrow.diagnose.models.law_terms.VECTORS
-    coefficient: float
-    sd: float
+    sd: float  # of the coefficient
     unit: str
     nats: float  # of evidence, less the log of the number of terms tried
     covariance: tuple[

@@ -409,6 +409,6 @@ def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     for j, size, row, variance in zip(columns, mean[columns] * floor, spread, spread.diagonal()):
         term = effects[j].term
         sd = float(np.sqrt(variance))
-        head = term.formula, term.block, term.factors, term.vector
-        found.append(Law(*head, float(size), sd, term.unit, float(nats), tuple(row.tolist())))
+        head = term.block, term.factors, term.vector, float(size), term.formula
+        found.append(Law(*head, sd, term.unit, float(nats), tuple(row.tolist())))
     return tuple(found)
