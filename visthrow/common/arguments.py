@@ -11,7 +11,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -94,12 +93,17 @@ def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None
             add_table(action, actions.add_parser(name, formatter_class=form, **texts))
 
 
-def declare(module: str) -> Callable[[argparse.ArgumentParser], None]:
-    """Return a command's ``add_arguments``: its table in the ``commands.toml`` beside its module,
-    named as that is.
+def declare(*modules: str) -> Callable[[argparse.ArgumentParser], None]:
+    """Return a command's ``add_arguments``: of each module its table in the ``commands.toml``
+    beside it, named as that is.
     """
-    tables = tables_beside(module, "commands.toml")
-    return partial(add_table, tables[Path(module).stem])
+    tables = [tables_beside(module, "commands.toml")[Path(module).stem] for module in modules]
+
+    def add_all(parser: argparse.ArgumentParser) -> None:
+        for table in tables:
+            add_table(table, parser)
+
+    return add_all
 
 
 def add_commands(

@@ -24,18 +24,6 @@ THROW = "throw"  # name of the model that is no setup's own: the whole throw
 add_arguments = declare(__file__)
 
 
-def declared_with_logs(module: str) -> Callable[[argparse.ArgumentParser], None]:
-    """Return a command's ``add_arguments``: those of logs and model, then the command's, as of
-    `visthrow.common.arguments.declare`.
-    """
-
-    def add_all(parser: argparse.ArgumentParser) -> None:
-        add_arguments(parser)
-        declare(module)(parser)
-
-    return add_all
-
-
 class Opened:
     """Logs, and the model of them once it is asked for.
 

@@ -5,10 +5,11 @@ been named.
 import argparse
 from pathlib import Path
 
+from visthrow.common.arguments import declare
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import model_arguments as opening
 
-add_arguments = opening.declared_with_logs(__file__)
+add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common import provenance
+from visthrow.common.arguments import declare
 from visthrow.common.storage import check_place, write_json
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.likelihood.forms import readable, unit_of
@@ -25,7 +26,7 @@ REFUSED = 1
 DIAGNOSIS = "diagnosis.json"  # in the report's folder; `diagnose apply` reads it
 
 
-add_arguments = opening.declared_with_logs(__file__)
+add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:

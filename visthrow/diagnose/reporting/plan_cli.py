@@ -7,10 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+from visthrow.common.arguments import declare
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import model_arguments as opening
 
-add_arguments = opening.declared_with_logs(__file__)
+add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -2,7 +2,6 @@
 its motors there.
 """
 
-from abc import abstractmethod
 from collections.abc import Container, Sequence
 
 import numpy as np
@@ -25,19 +24,15 @@ class DrivenModel(NumericModel):
     knot_count = 8
 
     def __init__(self, logs: Sequence[FlightLog], params: QuadrotorParams) -> None:
-        """Cut the flights into windows.
+        """Cut the flights into windows; the channels that are looked at, that drive the model, and
+        that it needs are known.
 
         Raises LogError where no log has the channels, or none flies.
         """
-        self.describe(logs, params)
         blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
         self.pushes = [(block, axis) for block in blocks for axis in range(3)]
         super().__init__(logs, params)
         self.steps = round(params.window / params.step)
-
-    @abstractmethod
-    def describe(self, logs: Sequence[FlightLog], params: QuadrotorParams) -> None:
-        """Set the channels that are looked at, that drive the model, and that it needs."""
 
     @property
     def motors(self) -> int:

@@ -40,18 +40,15 @@ class FlyerModel(DrivenModel):
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
         """See the base class."""
-        super().__init__(logs, params)
-        self.row = params.step / ROWS  # between commands of a flight [s]
-        self.rows = ROWS * self.steps
-
-    def describe(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
-        """See the base class."""
         optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
         simulated = [name for name, part in optional.items() if part is not None]
         self.channels = (params.position, *simulated)
         drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         self.inputs = (params.attitude, params.input, *drivers)
         self.needed = (params.position, params.attitude, params.input, *simulated)
+        super().__init__(logs, params)
+        self.row = params.step / ROWS  # between commands of a flight [s]
+        self.rows = ROWS * self.steps
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""

@@ -50,7 +50,7 @@ class ImuModel(DrivenModel):
     channels = CHANNELS
     lawless = "nothing tells the attitude and the velocity that a law is made of"
 
-    def describe(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
+    def __init__(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
         """See the base class; the gyro is left out where the setup states no torques, or where the
         motors do not tell what turns the vehicle.
         """
@@ -62,6 +62,7 @@ class ImuModel(DrivenModel):
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
             self.channels = CHANNELS[:1]
             self.notes = (_why_not(turned, params.input),)
+        super().__init__(logs, params)
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
