@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.optimize import differential_evolution
+from scipy.optimize import brentq, differential_evolution
 from scipy.stats import qmc
 
 from visthrow.common.errors import DiagnoseError
@@ -51,7 +51,6 @@ with all sweeps at once, few fly.
 """
 
 ROUNDING = 1e-9  # by which a path that is known to be safe may leave its own limits [m, m/s, m/s^2]
-HALVINGS = 20  # until the share of a sweep that fits is known
 SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wants it
 
 
@@ -75,8 +74,9 @@ class Limits:
     thrust: float = 0.4  # added to the thrust, as a share of it
 
     def __post_init__(self) -> None:
-        smallest = min(*self.half, self.speed, self.acceleration, self.rate, self.thrust)
-        if not (smallest > 0.0 and self.highest > self.lowest > 0.0):
+        numbers = np.hstack([*vars(self).values()])
+        positive = np.all((numbers > 0.0) & (numbers < np.inf))
+        if not (positive and self.highest > self.lowest):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
     def hold(self, path: ndarray) -> bool:
@@ -87,12 +87,11 @@ class Limits:
         """Largest share of a further way, 1 at most, with which a path keeps within them."""
         if self.hold(path + added):
             return 1.0
-        share = 0.0
-        for halving in range(1, HALVINGS + 1):
-            further = share + 0.5**halving
-            if self.hold(path + further * added):
-                share = further
-        return share
+
+        def beyond(share: float) -> float:
+            return np.max(_extremes(path + share * added) - self._most) - 0.5 * ROUNDING
+
+        return brentq(beyond, 0.0, 1.0)
 
     def around(self, path: ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""

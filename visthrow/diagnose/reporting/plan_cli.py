@@ -3,7 +3,6 @@ reference to fly.
 """
 
 import argparse
-import math
 from pathlib import Path
 from typing import Any
 
@@ -93,17 +92,12 @@ def _limits(args: argparse.Namespace):
 
     try:
         x, y, z = (float(part) for part in args.hall.split(","))
-    except ValueError as error:
+        return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
+    except (ValueError, DiagnoseError) as error:
         raise DiagnoseError(
-            f"--hall {args.hall}: expected three lengths in metres between commas, such as 5,5,2.6"
+            f"--hall {args.hall}: expected three lengths in metres between commas, such as"
+            f" 5,5,2.6, and a height above {Limits.lowest:g} m, the lowest that is flown"
         ) from error
-    lowest = Limits.lowest
-    if not (0.0 < x < math.inf and 0.0 < y < math.inf and lowest < z < math.inf):
-        raise DiagnoseError(
-            f"--hall {args.hall}: expected lengths above 0 and a height above {lowest:g} m, the"
-            " lowest that is flown"
-        )
-    return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
 
 
 def _print(ranked) -> None:
