@@ -148,6 +148,17 @@ def test_wrong_axes(channel, order, signs):
     assert channel in found
 
 
+@mark.parametrize("unread", [(), ("acc_b",)])
+@mark.parametrize(("turned_deg", "refused"), [(3.0, False), (-10.0, True)])
+def test_a_path_turned_beside_its_attitude_is_refused(unread, turned_deg, refused):
+    columns = {name: values for name, values in flight().items() if name not in unread}
+    turn = Rotation.from_euler("z", turned_deg, degrees=True)
+    turned = {name: turn.apply(columns[name]) for name in ("pos_w", "vel_w")}
+    (checked,) = check([log_of(columns | turned)])
+    said = [r.figures["turned_deg"] for r in checked.rows if r.figures.get("of") == "path"]
+    assert said == [approx(turned_deg, abs=0.5)] * refused
+
+
 @mark.parametrize(
     ("channel", "rows", "change", "verdict", "words"),
     [
@@ -718,7 +729,9 @@ def test_a_turned_accelerometer_is_named(turned_deg, late, words):
 
 
 def test_a_payload_that_swings_in_circles_exchanges_no_axes():
-    """A velocity that a filter delays looks like a quarter turn of the cable's pull."""
+    """A velocity that a filter delays looks like a quarter turn of the cable's pull; on a circle
+    drag looks like a turned path.
+    """
     time = np.arange(0.0, 20.0, 0.01)
     circle = np.column_stack([np.cos(6.0 * time), np.sin(6.0 * time), np.zeros_like(time)])
     force_w = circle + [0.0, 0.0, G]
@@ -729,6 +742,8 @@ def test_a_payload_that_swings_in_circles_exchanges_no_axes():
     vel = np.column_stack([np.sin(late), -np.cos(late), np.zeros_like(time)]) / 6.0
     log = log_at(time, vel_w=vel, quat_wb=turn.as_quat(), acc_b=force)
     assert "acc_b fits" not in faults(log)
+    dragged = upright(force_w + 2.0 * vel).as_quat()
+    assert not faults(log_at(time, vel_w=vel, quat_wb=dragged))
 
 
 def test_commands_that_come_ten_times_a_second_are_of_no_other_flight():

@@ -11,7 +11,7 @@ import numpy as np
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back, tilt_deg
 from visthrow.logs.axes import EXCHANGES, is_mirror
-from visthrow.logs.check import relations
+from visthrow.logs.check import headings, relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
@@ -353,12 +353,28 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     if relation is None:
         return
     wrong = _report_exchange(relation, channels)
+    if wrong is None:
+        velocity = motion.derivative(_SPAN) if log[path].unit == "m" else motion
+        wrong = _turned_path(headings.turn_of(time, acc, pushed, velocity.at(time)), channels)
     if wrong is None and sensed:
         wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is not None:
         yield wrong
     if wrong is None or wrong.verdict == "warn":
         yield from _check_push(relation, acc, pushed, channels, sensed)
+
+
+def _turned_path(turn: headings.Turn, channels: str) -> Row | None:
+    """Return a row where positions and velocities are surely turned about z."""
+    if turn.nats < _NATS or turn.alone < CLEARLY:
+        return None
+    angle, sd = np.degrees([turn.angle, turn.sd])
+    text = (
+        f"positions and velocities are turned by {angle:+.1f} deg about z (sd {sd:.1f} deg),"
+        f" {turn.nats:.0f} nats better: path and attitude are of two frames"
+    )
+    figures = {"turned_deg": angle, "sd_deg": sd, "of": "path", "nats": turn.nats}
+    return Row("frames", channels, "bad", text, figures)
 
 
 def _find_hanging(

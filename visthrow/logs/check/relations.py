@@ -225,10 +225,17 @@ class _Blocks:
             if nats < _NATS or abs(vertex - slope / bend) > half:
                 return vertex, np.inf
             vertex -= slope / bend
-        # noise may last longer than a block: neighbours count together, paired in both ways
-        pairs = np.convolve(slopes, [1.0, 1.0])
-        variance = 0.5 * np.sum(pairs**2) * BLOCKS / (BLOCKS - 2)
-        return vertex, _STUDENT * (np.sqrt(variance) / -bend)
+        return vertex, np.sqrt(variance_of_sum(slopes)) / -bend
+
+
+def variance_of_sum(scores: np.ndarray) -> float:
+    """Return the variance of the sum of blocks' scores, shape (BLOCKS,), whose mean is 0, that
+    Student's quantile makes of their scatter.
+
+    Noise may last longer than a block: neighbours count together, paired in both ways."""
+    pairs = np.convolve(scores, [1.0, 1.0])
+    scatter = 0.5 * np.sum(np.abs(pairs) ** 2) * BLOCKS / (BLOCKS - 2)
+    return float(_STUDENT**2 * scatter)
 
 
 def unit_hint(ratio: float) -> str:
