@@ -73,7 +73,7 @@ def pictures(name: str) -> list[np.ndarray]:
     samples, scale = (2 if name == "charuco" else 3), 60
     page = texture(board, scale)
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
-    rays, seen = pixel_rays(lens.params, samples)
+    rays, visible = pixel_rays(lens.params, samples)
     rays = rays.float()
     found = []
     for *tilt, x, y in POSES:
@@ -83,7 +83,7 @@ def pictures(name: str) -> list[np.ndarray]:
         depth = (normal @ origin) / (rays @ normal)
         on_board = (rays * depth[..., None] - origin) @ rot_cm / board.square_size
         u, v = ((on_board[..., i] + 2.0) * scale - 0.5 for i in (0, 1))
-        inside = (seen & (depth > 0.0)).numpy()
+        inside = (visible & (depth > 0.0)).numpy()
         drawn = cv2.remap(
             page,
             u.numpy(),

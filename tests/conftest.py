@@ -33,9 +33,9 @@ def refused(capsys):
     """Function that runs a command, which must end with status 2 and say why."""
     from tests.commands import run_command
 
-    def run(line, *words, said, sets=()):
+    def run(line, *words, message, sets=()):
         assert run_command(line, *words, sets=sets) == 2
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
 
     return run
 

@@ -111,10 +111,10 @@ def _log(
         1 + x.scale
     )
     ball = frame.apply(track["payload_pos_w"] + np.array(x.payload_offset)) * (1 + x.scale)
-    seen = frame * turned * marker
+    markers = frame * turned * marker
     count = len(times)
     pos = pos + noise * NOISE["pos_w"] * rng.normal(size=pos.shape)
-    seen = seen * Rotation.from_rotvec(noise * NOISE["quat_wb"] * rng.normal(size=(count, 3)))
+    markers = markers * Rotation.from_rotvec(noise * NOISE["quat_wb"] * rng.normal(size=(count, 3)))
     ball = ball + noise * NOISE["payload_pos_w"] * rng.normal(size=ball.shape)
     flying = track["payload_pos_w"][:, 2] > setting.plant.release.landing_height
     flying = np.logical_and.accumulate(flying)
@@ -122,7 +122,7 @@ def _log(
     sent = TICK * RATIO * np.arange(len(commands))
     channels = {
         "pos_w": Channel(times + x.vehicle_delay, pos, "m", "world"),
-        "quat_wb": Channel(times + x.vehicle_delay, seen.as_quat(), "1", "world"),
+        "quat_wb": Channel(times + x.vehicle_delay, markers.as_quat(), "1", "world"),
         "payload_pos_w": Channel(times + x.payload_delay, ball, "m", "world", flying),
         "command": Channel(sent, commands, "N, rad/s", "body"),
         "battery_voltage": Channel(sent, track["voltage"], "V"),

@@ -49,7 +49,7 @@ def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:
 
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]  # first number of an action that hovers
-NEVER, AT_ONCE = (simple_policy((HOVER, 0.0, 0.0, 0.0, asked)) for asked in (-1.0, 1.0))
+NEVER, AT_ONCE = (simple_policy((HOVER, 0.0, 0.0, 0.0, latch)) for latch in (-1.0, 1.0))
 """Policies that hover and ask for the release."""
 
 

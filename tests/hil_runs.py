@@ -39,9 +39,9 @@ def record_run(
 
     Without ``close`` the run ends as if killed.
     """
-    wanted = params(*overrides)
-    runner = Runner(wanted, Policy.load(find_policy(wanted.policy)), Spy())
-    recorder, decisions = RunRecorder(folder, wanted), []
+    settings = params(*overrides)
+    runner = Runner(settings, Policy.load(find_policy(settings.policy)), Spy())
+    recorder, decisions = RunRecorder(folder, settings), []
     tick = runner.tick
 
     def keep(time, poses, status, words, recording=True):

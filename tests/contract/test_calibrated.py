@@ -28,10 +28,12 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
     turn, scale = 0.05 * torch.randn(8, 3), 0.03 * torch.randn(8)
     goal = torch.randn(8, 3)
     nominal, _ = keypoints(camera, pos, rot, goal, load)
-    seen, valid = keypoints(
+    observed, valid = keypoints(
         camera, pos, rot, goal, load, camera.extrinsics(turn, torch.zeros(8, 3))
     )
-    got, left = correct_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
+    got, left = correct_keypoints(
+        camera, observed * (1.0 + scale[:, None, None]), valid, turn, scale
+    )
     assert left.all()
     assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
     assert_close(got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3)  # a box is upright in each image

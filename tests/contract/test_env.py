@@ -65,11 +65,13 @@ def test_the_papers_recipe_and_nothing_else(name):
     """
     paper = load_experiment(name)
     env = ThrowEnv(paper, count=32, seed=1)
-    seen, reward, _, extras = env.step(torch.zeros(32, 5))
+    observations, reward, _, extras = env.step(torch.zeros(32, 5))
     assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
-    assert seen["actor"].shape == (32, 61 if "vision" in name else 35)
-    assert seen["critic"].shape == (32, 38)
-    assert_array_equal(seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy())
+    assert observations["actor"].shape == (32, 61 if "vision" in name else 35)
+    assert observations["critic"].shape == (32, 38)
+    assert_array_equal(
+        observations["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy()
+    )
     assert not env.delay.age.any()
     assert env.views.state["charge_used"].max() < 1e-3, (
         "share of a full battery that one step may draw"
@@ -79,10 +81,12 @@ def test_the_papers_recipe_and_nothing_else(name):
         "a second costs 2 as in Table II; what is left are speeds and commands"
     )
     assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == approx(2e8, rel=1e-3)
-    kept = seen.clone()
+    kept = observations.clone()
     env.step(torch.zeros(32, 5))
     for group in ("actor", "critic"):
-        assert torch.equal(seen[group], kept[group]), "the next step writes tensors of its own"
+        assert torch.equal(observations[group], kept[group]), (
+            "the next step writes tensors of its own"
+        )
 
 
 def test_the_critic_sees_what_is_named():
@@ -98,11 +102,16 @@ def test_the_critic_sees_what_is_named():
         "pose_age": 1,
     }
     for chosen in [(), ("exact",), ("mass",), ("exact", "mount"), tuple(named), ("exact", *named)]:
-        own = replace(e, ppo=replace(e.ppo, privileged=chosen))
-        seen = ThrowEnv(own, count=4).get_observations()
+        altered = replace(e, ppo=replace(e.ppo, privileged=chosen))
+        observations = ThrowEnv(altered, count=4).get_observations()
         known = sum(named.get(name, 0) for name in chosen)
-        assert seen["critic"].shape == (4, 35 + known)  # exact: the same parts without their noise
-        assert torch.equal(seen["critic"][:, :35], seen["actor"]) == ("exact" not in chosen)
+        assert observations["critic"].shape == (
+            4,
+            35 + known,
+        )  # exact: the same parts without their noise
+        assert torch.equal(observations["critic"][:, :35], observations["actor"]) == (
+            "exact" not in chosen
+        )
     with raises(ConfigError, match=r"ppo\.privileged has 'velocity'; .*payload_velocity"):
         replace(e.ppo, privileged=("velocity",))
 

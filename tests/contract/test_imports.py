@@ -119,7 +119,7 @@ def test_an_optional_room_names_its_extra(monkeypatch, refused):
 
     monkeypatch.setitem(sys.modules, "piqp", None)
     monkeypatch.delitem(sys.modules, "visthrow.paper.baseline.rival", raising=False)
-    refused("compare baseline --throws 1", said="pip install 'visthrow[paper]'")
+    refused("compare baseline --throws 1", message="pip install 'visthrow[paper]'")
 
 
 def test_the_core_trains_flies_compares_and_diagnoses_without_the_extras(tmp_path):

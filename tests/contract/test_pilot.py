@@ -54,15 +54,15 @@ def test_observation_and_command_equal_the_environments(name):
             one = slice(e, e + 1)
             views = (state[key][one] for key in ("pos_w", "quat_wb", "vel_w", "rate_b"))
             outs.append(pilot.act(*views, payload[one], goal[one], state["attached"][one]))
-        seen = np.concatenate([out.observation for out in outs])
-        assert_allclose(seen, shown.numpy(), rtol=0.0, atol=0.0 if name == "state" else ROW)
+        observed = np.concatenate([out.observation for out in outs])
+        assert_allclose(observed, shown.numpy(), rtol=0.0, atol=0.0 if name == "state" else ROW)
         action = torch.from_numpy(np.concatenate([out.action for out in outs]))
         observations, _, done, _ = env.step(action)
         shown = observations["actor"].clone()
         going = done.numpy() == 0
-        for sent, wanted in (("command", env.views.command), ("release", env.views.release)):
+        for sent, expected in (("command", env.views.command), ("release", env.views.release)):
             ours = np.concatenate([getattr(out, sent) for out in outs])
-            assert_array_equal(ours[going], wanted.numpy()[going])
+            assert_array_equal(ours[going], expected.numpy()[going])
         released += int(env.last["released"].sum())
         for e in torch.nonzero(done).flatten().tolist():
             pilots[e].start()

@@ -55,6 +55,6 @@ def test_graph_equals_launches():
 
 def test_cuda_agrees_with_the_cpu():
     plant = replace(paper_plant(), sim=numerics(precision="float64"))
-    there, here = (driven(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
+    on_cuda, on_cpu = (driven(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
     for name in ("pos_w", "payload_pos_w", "landing_w"):
-        assert_allclose(there[name], here[name], atol=SAME, err_msg=name)
+        assert_allclose(on_cuda[name], on_cpu[name], atol=SAME, err_msg=name)

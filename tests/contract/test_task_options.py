@@ -66,9 +66,9 @@ def test_a_moving_goal_is_observed_late_and_its_velocity_is_learnt():
     assert_allclose(
         actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01
     )  # the prior still pulls a little
-    goal_seen = actor[:, 20:22] + actor[:, 22:24] + actor[:, :2]
+    observed = actor[:, 20:22] + actor[:, 22:24] + actor[:, :2]
     expected = (env.views.goal_w[alive] - 0.01 * velocity)[:, :2]
-    assert_allclose(goal_seen, expected, atol=1e-5)
+    assert_allclose(observed, expected, atol=1e-5)
     assert (obs["critic"][alive][:, -2:] == velocity[:, :2]).all()
 
 
@@ -89,8 +89,10 @@ def test_payloads_vary_in_every_combination():
     params = experiment("state_payload")
     ropes = rope_variants(params.rope, params.task.start)
     assert len(ropes) == 6 * 5 * 5
-    seen = {(round(r.length, 6), round(r.payload_mass, 6), round(r.payload_drag, 9)) for r in ropes}
-    assert len(seen) == len(ropes)
+    sizes = {
+        (round(r.length, 6), round(r.payload_mass, 6), round(r.payload_drag, 9)) for r in ropes
+    }
+    assert len(sizes) == len(ropes)
     masses = np.array([r.payload_mass for r in ropes]) / params.rope.payload_mass
     assert (masses.min(), masses.max()) == approx((0.8, 1.2))
     gyration = [r.payload_inertia / r.payload_mass for r in ropes]
@@ -165,10 +167,10 @@ def test_a_policy_is_not_flown_in_wind_or_under_laws_without_allowance():
     )
     for name in ("state", "any"):
         load_policy(name)
-        for change, said, allowed in (law, wind):
+        for change, message, allowed in (law, wind):
             with raises(MismatchError) as error:
                 load_policy(name, overrides=[change])
-            assert said in str(error.value)
+            assert message in str(error.value)
             if (name, change) != ("any", law[0]):
                 assert load_policy(name, overrides=[change], allow=allowed).departures
 
@@ -203,14 +205,14 @@ def test_a_policy_is_flown_without_what_only_its_training_had():
     """``flown`` of its configuration comes before what the user names; a latency that it was
     trained for is no refusal.
     """
-    own, named = (
+    loaded, named = (
         load_policy("vision"),
         load_policy("vision", overrides=["camera.noise.drop_probability=0.3"]),
     )
     trained = experiment("vision")
     assert trained.camera.noise.drop_probability == 0.1
-    assert own.experiment.camera.noise == experiment("vision_ideal").camera.noise
-    assert own.experiment.task.observation.latency == (0.008, 0.012)
+    assert loaded.experiment.camera.noise == experiment("vision_ideal").camera.noise
+    assert loaded.experiment.task.observation.latency == (0.008, 0.012)
     assert (
         named.experiment.camera.noise.drop_probability,
         named.experiment.camera.noise.scale_std,

@@ -67,7 +67,7 @@ def test_of_hours_of_flight_all_throws_and_the_liveliest_windows_are_looked_at()
     assert thinned(throws, [flight, flight]) == throws
 
 
-def told(line: dict) -> str:
+def explain_failure(line: dict) -> str:
     """Why a case failed."""
     return (
         f"{line['kind']} {line['recipe']}: {line.get('said')} {line.get('error', '')}"
@@ -83,4 +83,4 @@ def test_a_case_passes(kind):
     """
     seed = int.from_bytes(os.urandom(4))
     line = cases.run_case(cases.Task(kind, cases.draw(kind, seed), np.inf))
-    assert line["passed"], f"{told(line)}; done: {line.get('done')}"
+    assert line["passed"], f"{explain_failure(line)}; done: {line.get('done')}"

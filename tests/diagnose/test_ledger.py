@@ -26,8 +26,8 @@ def cells(kind, group):
         first, among = (
             sum(term in w["laws"][:count] for w, term in zip(group, terms)) for count in (1, 3)
         )
-        said = f"UNKNOWN in {len(group)}", f"true term first in {first}, among three in {among}"
-        return [*said, "-", f"wrong names beside it in {('none', 'one')[more]}"]
+        counts = f"UNKNOWN in {len(group)}", f"true term first in {first}, among three in {among}"
+        return [*counts, "-", f"wrong names beside it in {('none', 'one')[more]}"]
     if not hidden:
         return ["-", f"NO EFFECT in {sum(w['overall'] == 'NO EFFECT' for w in group)}", "-", more]
     total = f" of {hidden}" if kind in ("2x12", "3x12") else ""

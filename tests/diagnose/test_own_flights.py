@@ -23,7 +23,7 @@ def flown():
     return loaded, [fly(loaded, np.array([2.0, 0.0, 0.0]), seed=seed) for seed in SEEDS]
 
 
-def told(loaded, logs) -> diagnose_flights.Diagnosis:
+def diagnose(loaded, logs) -> diagnose_flights.Diagnosis:
     """What ``explain`` says of logs."""
     experiment = loaded.experiment
     return diagnose_flights.explain(
@@ -35,7 +35,7 @@ def test_flights_of_fly_hide_nothing(flown):
     """They did where measured poses were stamped when the pilot read them, 10 ms late: a release
     lag, and UNKNOWN.
     """
-    diagnosis = told(*flown)
+    diagnosis = diagnose(*flown)
     assert (diagnosis.overall, dict(diagnosis.theta), diagnosis.events) == ("NO EFFECT", {}, ())
 
 

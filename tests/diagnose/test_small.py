@@ -95,19 +95,19 @@ def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
     effect = TermEffect(
         term.formula, "", "", "", law.block, (-1.0, 1.0), 1.0, 1.0, (), "", term=term
     )
-    there = model.with_laws(laws).residuals({})
+    residuals = model.with_laws(laws).residuals({})
     column, change = [], []
-    for window, residual in zip(windows, there):
+    for window, residual in zip(windows, residuals):
         basis = np.linalg.qr(window.nuisance)[0]  # initial states are fitted in both
-        told = np.column_stack(
+        basis_columns = np.column_stack(
             [
                 window.latent @ forces(window, [effect])[:, 0] * law.coefficient,
                 window.residual - residual,
             ]
         )
-        told = (told - basis @ (basis.T @ told)) / window.sigma[:, None]
-        column.append(told[:, 0])
-        change.append(told[:, 1])
+        basis_columns = (basis_columns - basis @ (basis.T @ basis_columns)) / window.sigma[:, None]
+        column.append(basis_columns[:, 0])
+        change.append(basis_columns[:, 1])
     column, change = np.concatenate(column), np.concatenate(change)
     assert norm(column) > 0.1
     slope = column @ change / (column @ column)
@@ -138,9 +138,9 @@ def test_what_cannot_act_is_refused():
 def test_an_unknown_of_a_model_without_laws_says_so(tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     tests = DATA / "real" / "motor_prop_stand" / "all_tests.csv.gz"
-    said = printed(f"diagnose explain {tests}:a1_* --config motor_stand --no-report")
-    assert "UNKNOWN" in said
-    assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
+    output = printed(f"diagnose explain {tests}:a1_* --config motor_stand --no-report")
+    assert "UNKNOWN" in output
+    assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in output
 
 
 @mark.parametrize("kind", ["imu", "stand"])
@@ -164,7 +164,7 @@ def test_models_without_laws_say_why(kind, tmp_path, capsys):
     (tmp_path / "diagnosis.json").write_text(json.dumps(given))
     out = tmp_path / "extended.toml"
     assert run_command(f"diagnose apply {tmp_path}/diagnosis.json --laws 1 --out {out}") == 2
-    said = capsys.readouterr().err
-    assert f"no law can act in the model '{kind}'" in said
-    assert setups.MODELS[kind].lawless in said
+    error = capsys.readouterr().err
+    assert f"no law can act in the model '{kind}'" in error
+    assert setups.MODELS[kind].lawless in error
     assert not out.exists()

@@ -35,7 +35,7 @@ FACTS = values("betaflight")
 IDLE_AFTER = FACTS["receiver_hold"] + FACTS["receiver_recheck"]
 # the delay counts from the last look at a receiver that was not lost yet: 1.6 s in all, as the
 # firmware in software was measured
-STILL_THERE = FACTS["receiver_lost"] - FACTS["receiver_recheck"]
+RECEIVER_HELD = FACTS["receiver_lost"] - FACTS["receiver_recheck"]
 RECEIVER_LOST, LOW_FIRST = FACTS["block_receiver_lost"], FACTS["block_not_disarmed"]
 ARM_SWITCH, TILTED = FACTS["block_switch"], FACTS["block_angle"]
 REACTION = 0.5  # of the pilot, from the first stick frame to the override switch [s]
@@ -140,13 +140,13 @@ class FakeBetaflight(PortFake):
         if frame.command == msp.SET_RAW_RC:
             self._sticks_came(list(frame.words()))
         elif frame.command == msp.SET_RC_TUNING and not self.armed:
-            told = {
-                name: told.offset
-                for name, told in SETTINGS.items()
-                if told.command == msp.RC_TUNING
+            offsets = {
+                name: setting.offset
+                for name, setting in SETTINGS.items()
+                if setting.command == msp.RC_TUNING
             }
             self.parameters.update(
-                {name: frame.payload[at] for name, at in told.items() if at < len(frame.payload)}
+                {name: frame.payload[at] for name, at in offsets.items() if at < len(frame.payload)}
             )
             self._set_rates()
         elif frame.command in SIZES:
@@ -170,10 +170,13 @@ class FakeBetaflight(PortFake):
 
     def _settings(self, command: int) -> bytes:
         out = bytearray(SIZES[command])
-        for name, told in SETTINGS.items():
-            if told.command == command:
+        for name, setting in SETTINGS.items():
+            if setting.command == command:
                 struct.pack_into(
-                    told.code, out, told.offset, round(self.parameters.get(name, 0) / told.scale)
+                    setting.code,
+                    out,
+                    setting.offset,
+                    round(self.parameters.get(name, 0) / setting.scale),
                 )
         return bytes(out)
 
@@ -272,7 +275,7 @@ class FakeBetaflight(PortFake):
             return self.hold(self._place)
         if quiet > IDLE_AFTER:
             self.happened("failsafe: motors idle")
-        if quiet > self.parameters["failsafe_delay"] + STILL_THERE:
+        if quiet > self.parameters["failsafe_delay"] + RECEIVER_HELD:
             self.armed, self.override, self._disarmed = False, False, True
             self.happened("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target

@@ -170,23 +170,23 @@ class FakeCrazyflie(PortFake):
             "crashed": self.supervisor == CRASHED,
         }
         bits = sum(FACTS[name] for name, on in state.items() if on)
-        told = bytes([FACTS["ask_state"] | FACTS["answer"]]) + struct.pack("<H", bits)
-        self._answer("port_supervisor", "channel_info", told)
+        payload = bytes([FACTS["ask_state"] | FACTS["answer"]]) + struct.pack("<H", bits)
+        self._answer("port_supervisor", "channel_info", payload)
 
     def _tell_version(self, data: bytes) -> None:
         if data[0] == FACTS["ask_protocol"]:
-            told = bytes([FACTS["ask_protocol"]]) + struct.pack("<i", self.protocol)
-            self._answer("port_platform", "channel_version", told)
+            payload = bytes([FACTS["ask_protocol"]]) + struct.pack("<i", self.protocol)
+            self._answer("port_platform", "channel_version", payload)
 
     def _command(self, data: bytes) -> None:
         if data[0] != FACTS["arm"] or len(data) < 2:
             return
-        wanted = bool(data[1])
-        if wanted and not (self.supervisor == PASSED and self.options.arming):
+        arm = bool(data[1])
+        if arm and not (self.supervisor == PASSED and self.options.arming):
             return
-        if wanted != self.armed:
-            self.armed = wanted
-            self.happened("armed" if wanted else "disarmed")
+        if arm != self.armed:
+            self.armed = arm
+            self.happened("armed" if arm else "disarmed")
 
     def _set_parameter(self, data: bytes) -> None:
         if data[0] != FACTS["set_by_name"] or data.count(b"\0") < 2:
@@ -206,17 +206,17 @@ class FakeCrazyflie(PortFake):
             self.witness.answered()
             error = FACTS["no_entry"] if self.options.answer == "denied" else error
             self.open_mechanism()
-        told = data[: len(data) - len(rest)] + bytes([error])
-        self._answer("port_param", "channel_by_name", told)
+        payload = data[: len(data) - len(rest)] + bytes([error])
+        self._answer("port_param", "channel_by_name", payload)
 
     def _tell_variable(self, data: bytes) -> None:
         if data[0] == FACTS["log_info"]:
-            told = struct.pack("<BHI", FACTS["log_info"], len(VARIABLES), 0)
+            payload = struct.pack("<BHI", FACTS["log_info"], len(VARIABLES), 0)
         else:
             _, number = struct.unpack_from("<BH", data)
             name = VARIABLES[number].replace(".", "\0").encode() + b"\0"
-            told = struct.pack("<BHB", FACTS["log_item"], number, FACTS["log_float"]) + name
-        self._answer("port_log", "log_contents", told)
+            payload = struct.pack("<BHB", FACTS["log_item"], number, FACTS["log_float"]) + name
+        self._answer("port_log", "log_contents", payload)
 
     def _log(self, data: bytes) -> None:
         """Create or start a block of variables."""

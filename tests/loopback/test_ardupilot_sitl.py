@@ -111,9 +111,9 @@ def test_motors_turn_the_vehicle_as_ardupilot_means_them(bridge, change, axis):
     rise(bridge)
     assert not bridge.plant.held
     states = fly(bridge, [(200 + n, servos(*(HOVER + 20 + np.array(change)))) for n in range(25)])
-    told = np.array(states[-1]["imu"]["gyro"])
-    assert told[axis] > 0.02
-    assert told[axis] > 3.0 * np.abs(np.delete(told, axis)).max()
+    gyro = np.array(states[-1]["imu"]["gyro"])
+    assert gyro[axis] > 0.02
+    assert gyro[axis] > 3.0 * np.abs(np.delete(gyro, axis)).max()
 
 
 def test_the_mechanisms_output_lets_the_ball_go(bridge):

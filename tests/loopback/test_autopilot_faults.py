@@ -42,7 +42,7 @@ def run(
     )
     runner, source, clock, fake = made
     operator = operator or AutoOperator()
-    told, tick = [], runner.tick
+    decisions, tick = [], runner.tick
 
     def ticked(now, *args, **kwargs):
         if watch is not None:
@@ -50,17 +50,17 @@ def run(
         return tick(now, *args, **kwargs)
 
     runner.tick = ticked
-    summary = cut(runner, source, clock, operator, recorder, seconds, told.append)
+    summary = cut(runner, source, clock, operator, recorder, seconds, decisions.append)
     assert fake.witness.breaches == []
-    return fake, summary, [(d.state, d.reason, d.time) for d in told]
+    return fake, summary, [(d.state, d.reason, d.time) for d in decisions]
 
 
-def when(told, state: str) -> float:
-    return next(time for name, _, time in told if name == state)
+def when(decisions, state: str) -> float:
+    return next(time for name, _, time in decisions if name == state)
 
 
-def reason(told, state: str) -> str:
-    return next(text for name, text, _ in told if name == state)
+def reason(decisions, state: str) -> str:
+    return next(text for name, text, _ in decisions if name == state)
 
 
 GONE = "the autopilot is silent, disarmed or in another mode"
@@ -71,9 +71,9 @@ def test_silent(kind):
     """Abort after the heartbeat's time-out, counted from the last sign of life."""
     limit = 0.5 if kind == "betaflight" else 1.5
     override = () if kind == "betaflight" else (f"{kind}.heartbeat_timeout=1.5",)
-    _, _, told = run(kind, START + 2.2, silent_after=START, overrides=override)
-    assert reason(told, "abort").startswith(GONE)
-    assert START + limit - BEAT[kind] - TICK <= when(told, "abort") <= START + limit + 2 * TICK
+    _, _, decisions = run(kind, START + 2.2, silent_after=START, overrides=override)
+    assert reason(decisions, "abort").startswith(GONE)
+    assert START + limit - BEAT[kind] - TICK <= when(decisions, "abort") <= START + limit + 2 * TICK
 
 
 @mark.parametrize("kind", AUTOPILOTS)
@@ -88,9 +88,9 @@ def test_the_pilot_takes_over(kind):
             modes.add(getattr(fake, "mode", None))
 
     commands, modes = set(), set()
-    fake, _, told = run(kind, START + 1.0, watch=watch, taken_after=START)
-    assert reason(told, "abort").startswith(GONE)
-    assert when(told, "abort") <= START + BEAT["betaflight"] + 3 * TICK
+    fake, _, decisions = run(kind, START + 1.0, watch=watch, taken_after=START)
+    assert reason(decisions, "abort").startswith(GONE)
+    assert when(decisions, "abort") <= START + BEAT["betaflight"] + 3 * TICK
     assert (len(commands), len(modes)) == (1, 1), "silent: the pilot has it"
     assert fake.taken
 
@@ -108,17 +108,17 @@ def test_a_pilots_hold_at_the_end_of_a_throw_stands(before):
             taken.append(now)
             fake.enter(HOLD)
 
-    fake, _, told = run("px4", START + 2.0, loaded=AT_ONCE, watch=watch)
-    assert told[-1][0] == "done"
-    assert reason(told, "abort").startswith(GONE)
+    fake, _, decisions = run("px4", START + 2.0, loaded=AT_ONCE, watch=watch)
+    assert decisions[-1][0] == "done"
+    assert reason(decisions, "abort").startswith(GONE)
     modes = [text for time, text in fake.events if time >= taken[0] and text.startswith("mode")]
     assert modes == ["mode 4.3"]
 
 
 @mark.parametrize("kind", AUTOPILOTS)
 def test_disarmed_and_not_ours_to_arm(kind):
-    fake, _, told = run(kind, 4.0, armed=False, overrides=("states.idle=1.5",))
-    assert reason(told, "abort") == "autopilot not ready (disarmed), for 1.5 s"
+    fake, _, decisions = run(kind, 4.0, armed=False, overrides=("states.idle=1.5",))
+    assert reason(decisions, "abort") == "autopilot not ready (disarmed), for 1.5 s"
     assert fake.witness.commands == 0
 
 
@@ -132,9 +132,11 @@ def test_refuses_arming(kind, override):
     def listen(now, runner, fake):
         notes.append(runner.backend.status(now).note)
 
-    fake, _, told = run(kind, 5.0, armed=False, arming=False, overrides=(override,), watch=listen)
-    assert reason(told, "abort").startswith(GONE)
-    assert when(told, "abort") - when(told, "ready") < 1.6
+    fake, _, decisions = run(
+        kind, 5.0, armed=False, arming=False, overrides=(override,), watch=listen
+    )
+    assert reason(decisions, "abort").startswith(GONE)
+    assert when(decisions, "abort") - when(decisions, "ready") < 1.6
     assert any("arming refused with result 4: Arm: battery below minimum" in note for note in notes)
     assert not fake.armed
     assert fake.witness.releases == 0
@@ -142,13 +144,13 @@ def test_refuses_arming(kind, override):
 
 @mark.parametrize("kind", ["ardupilot", "px4"])
 def test_arms_on_the_named_port(kind):
-    fake, _, told = run(kind, 4.0, armed=False, overrides=(f"{kind}.arm=true",))
-    assert "throw" in [state for state, _, _ in told]
+    fake, _, decisions = run(kind, 4.0, armed=False, overrides=(f"{kind}.arm=true",))
+    assert "throw" in [state for state, _, _ in decisions]
     assert "armed" in [text for _, text in fake.events]
 
 
 def test_betaflight_refuses_arming():
-    fake, _, told = run(
+    fake, _, decisions = run(
         "betaflight",
         4.0,
         armed=False,
@@ -157,7 +159,7 @@ def test_betaflight_refuses_arming():
         overrides=("betaflight.arm_channel=1", "states.idle=1.5"),
     )
     assert (
-        reason(told, "abort")
+        reason(decisions, "abort")
         == "autopilot not ready (arming disabled: tilted more than small_angle (flags 0x100)), for"
         " 1.5 s"
     )
@@ -190,7 +192,7 @@ def test_a_release_that_does_not_happen(kind, answer):
         if fake.witness.releases > len(last):
             last.extend([now] * (fake.witness.releases - len(last)))
 
-    fake, summary, told = run(
+    fake, summary, decisions = run(
         kind,
         6.0,
         AT_ONCE,
@@ -199,8 +201,8 @@ def test_a_release_that_does_not_happen(kind, answer):
         overrides=("px4.release_timeout=1.5",),
     )
     (latch,) = summary["latch_times"]
-    assert reason(told, "abort") == "the release was refused or not answered"
-    assert latch + limit <= when(told, "abort") <= latch + limit + 3 * TICK
+    assert reason(decisions, "abort") == "the release was refused or not answered"
+    assert latch + limit <= when(decisions, "abort") <= latch + limit + 3 * TICK
     assert (summary["latches"], summary["landings"], fake.release_time) == (1, [], None)
     if answer != "silent":
         assert fake.witness.releases == 1
@@ -220,12 +222,12 @@ def test_a_tick_overrun(kind, length):
                 fake.step()
 
     late = []
-    _, summary, told = run(kind, START + 1.2, watch=dawdle)
+    _, summary, decisions = run(kind, START + 1.2, watch=dawdle)
     assert summary["missed"] == approx(length / TICK, abs=2)
     if kind == "px4":
-        assert reason(told, "abort").startswith(GONE)
+        assert reason(decisions, "abort").startswith(GONE)
     else:
-        assert told[-1][0] == "throw"
+        assert decisions[-1][0] == "throw"
 
 
 @mark.parametrize(
@@ -238,8 +240,8 @@ def test_a_tick_overrun(kind, length):
 )
 def test_a_runner_that_is_killed_in_mid_throw_leaves_the_vehicle_to_its_failsafe(kind, event):
     """It falls silent between two ticks and never comes back."""
-    fake, _, told = run(kind, START)
-    assert told[-1][0] == "throw"
+    fake, _, decisions = run(kind, START)
+    assert decisions[-1][0] == "throw"
     for _ in range(round(2.5 / fake.plant.period)):
         fake.step()
     assert event in [text for _, text in fake.events]
@@ -273,8 +275,8 @@ def test_the_disk_is_full(tmp_path, full_at):
         while now >= full_at + 0.2 and not recorder.failed and time.monotonic() < patience:
             time.sleep(0.01)
 
-    fake, summary, told = run("ardupilot", START + 0.5, watch=fill, recorder=recorder)
-    states = [state for state, _, _ in told]
+    fake, summary, decisions = run("ardupilot", START + 0.5, watch=fill, recorder=recorder)
+    states = [state for state, _, _ in decisions]
     if full_at == 0.0:
         assert "throw" not in states
     else:

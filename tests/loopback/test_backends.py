@@ -178,7 +178,7 @@ def test_an_abort_lands(kind):
 
 
 @mark.parametrize("kind", ["ardupilot", "px4"])
-def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
+def test_an_abort_right_after_a_request_for_hold_still_lands(kind):
     """The heartbeat shows the hold when landing is wanted already: that is no pilot."""
     desk = Desk(kind).follow()
     desk.backend.ask(HOLD, desk.now)
@@ -192,7 +192,7 @@ def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
     assert desk.status.mode == LAND
 
 
-def test_px4_is_asked_for_offboard_only_after_a_second_of_set_points():
+def test_offboard_is_requested_of_px4_only_after_a_second_of_set_points():
     desk = Desk("px4")
     desk.turn(0.5)
     assert desk.state == (
@@ -224,7 +224,7 @@ def test_px4_in_position_mode_is_the_pilots_where_its_hold_was_requested():
     assert desk.status.mode != HOLD
 
 
-def test_px4_left_without_a_stream_is_not_asked():
+def test_px4_without_a_stream_gets_no_request():
     desk = Desk("px4")
     desk.turn(2.0, None, FOLLOW)
     assert desk.fake.mode == POSCTL
@@ -391,11 +391,11 @@ def test_px4_in_software_has_no_minimum_of_an_output():
 
 def test_parameters_of_the_config_are_audited_and_written():
     """A vehicle in software becomes the policy's by them."""
-    wanted, found = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
-    desk = Desk("px4", *wanted, parameters=found)
+    overrides, found = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
+    desk = Desk("px4", *overrides, parameters=found)
     desk.turn(0.5)
     assert desk.backend.audit.problems == ["SIH_MASS is 1; expected 0.272"]
-    desk = Desk("px4", *wanted, parameters=found, write=True)
+    desk = Desk("px4", *overrides, parameters=found, write=True)
     desk.turn(3.0)
     assert desk.status.fault is None
     assert desk.fake.parameters["SIH_MASS"] == approx(0.272)
@@ -409,12 +409,12 @@ def test_betaflight_is_not_written_while_it_is_armed():
 
 
 def test_a_run_ends_at_once_on_a_wrong_parameter():
-    summary, fake, told = throw(
+    summary, fake, decisions = throw(
         LevelPlant(), loaded=AT_ONCE, seconds=5.0, parameters={"GUID_OPTIONS": 0.0}
     )
     assert (summary["aborted"], fake.witness.commands) == (True, 0)
     assert summary["reason"] == "parameter audit: GUID_OPTIONS wrong, see the table"
-    assert told[-1].time < 1.0
+    assert decisions[-1].time < 1.0
 
 
 def test_without_the_audit_the_traps_are_what_they_are():
@@ -519,7 +519,7 @@ def test_a_complete_throw(kind, prompt):
     """Also where a change of mode is seen in a heartbeat up to a second later."""
     plant = LevelPlant()
     quick = QUICK if prompt else (*QUICK[:-1], "states.land=2.0", "states.quiet=1.2")
-    summary, fake, told = throw(
+    summary, fake, decisions = throw(
         plant, kind=kind, loaded=AT_ONCE, seconds=9.5, overrides=quick, prompt=prompt
     )
     assert (summary["latches"], len(summary["landings"]), summary["stuck"], summary["errors"]) == (
@@ -529,7 +529,7 @@ def test_a_complete_throw(kind, prompt):
         [],
     )
     assert (fake.witness.releases, fake.witness.breaches) == (1, [])
-    assert [d.state for d in told][:7] == [
+    assert [d.state for d in decisions][:7] == [
         "idle",
         "check",
         "ready",
@@ -647,8 +647,8 @@ def test_idle_says_at_once_why_it_waits():
     runner, source, clock, _ = peers(
         LevelPlant(), loaded=AT_ONCE, overrides=("states.idle=1.0",), armed=False
     )
-    told = []
-    Loop(runner, source, clock, AutoOperator(), None, told.append).fly(5.0)
-    waits = {d.waits: d.time for d in told if d.state == "idle"}
+    decisions = []
+    Loop(runner, source, clock, AutoOperator(), None, decisions.append).fly(5.0)
+    waits = {d.waits: d.time for d in decisions if d.state == "idle"}
     assert waits["autopilot not ready (disarmed)"] < 0.2
-    assert len(told) <= 8, "and not at every tick"
+    assert len(decisions) <= 8, "and not at every tick"

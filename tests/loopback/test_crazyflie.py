@@ -102,7 +102,7 @@ def test_a_firmware_without_manual_set_points_is_refused():
 
 
 @mark.parametrize(("state", "note"), [(LOCKED, "locked: restart it"), (CRASHED, "crashed")])
-def test_a_vehicle_that_may_not_fly_any_more_is_said_to(state, note):
+def test_a_vehicle_that_may_not_fly_any_more_is_reported(state, note):
     one = desk().follow()
     one.turn(0.3, HOVER)
     one.fake.supervisor, one.fake._supervise = state, lambda: None
@@ -169,9 +169,9 @@ def test_nobody_else_speaks_for_a_crazyflie():
     """Packets from another address neither connect, nor arm, nor release it: each is counted, and
     their sender said once.
     """
-    ticks, number, said = 200, free_port(), []
+    ticks, number, messages = 200, free_port(), []
     params = load_run("crazyflie", [f'crazyflie.device="udpout:127.0.0.1:{number}"'])
-    backend = make_backend(params, tell=said.append)
+    backend = make_backend(params, tell=messages.append)
     stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     stranger.bind(("127.0.0.2", 0))
     backend.service(0.0)  # sends, so that there is an address to answer
@@ -200,6 +200,6 @@ def test_nobody_else_speaks_for_a_crazyflie():
     assert backend.roster.refused == ticks * len(answers)
     host, port = stranger.getsockname()
     refusal = f"refused: datagram from {host}:{port}: the device is 127.0.0.1:{number}"
-    assert [text for text in said if "refused" in text] == [refusal]
+    assert [text for text in messages if "refused" in text] == [refusal]
     stranger.close()
     backend.close()

@@ -25,7 +25,7 @@ LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
 """What is asked for; Betaflight has no landing of its own: the runner flies a descent."""
 
 
-class Told:
+class Ending:
     """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks
     into a state.
     """
@@ -108,7 +108,7 @@ RUNS += [(way, "throw", AUTOPILOTS[i % 3]) for i, way in enumerate(REASONS) if w
 
 @mark.parametrize(("way", "state", "kind"), RUNS)
 def test_it_ends_by_landing(way, state, kind, monkeypatch):
-    run = Told(way, state, with_fake(kind, state), monkeypatch)
+    run = Ending(way, state, with_fake(kind, state), monkeypatch)
     assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (
         True,
         REASONS[way],
@@ -118,8 +118,8 @@ def test_it_ends_by_landing(way, state, kind, monkeypatch):
     if kind == "betaflight":
         assert run.fake.override, "it is the runner that brings it down"
         if way != "source raises":
-            asked = run.runner.hovering.place_w[2]
-            assert asked < 1.333 - 0.3 * 0.4, "a descent of 0.4 m/s, for 0.6 s"
+            height = run.runner.hovering.place_w[2]
+            assert height < 1.333 - 0.3 * 0.4, "a descent of 0.4 m/s, for 0.6 s"
     else:
         assert LANDS[kind] in [text for _, text in run.after]
         if way != "time over":
@@ -142,7 +142,7 @@ def twice(monkeypatch):
 def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(monkeypatch):
     """The landing was asked for by the first one; the summary is there."""
     twice(monkeypatch)
-    run = Told("SIGINT", "throw", with_fake("px4", "throw"), monkeypatch)
+    run = Ending("SIGINT", "throw", with_fake("px4", "throw"), monkeypatch)
     assert run.summary["aborted"]
     assert run.summary["ticks"] > 5
     assert run.runner.errors == []
@@ -152,7 +152,7 @@ def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(monkeypatch):
 
 
 def test_output_that_raises_ends_a_throw_by_landing(monkeypatch):
-    run = Told("output raises", "throw", with_fake("ardupilot", "throw"), monkeypatch)
+    run = Ending("output raises", "throw", with_fake("ardupilot", "throw"), monkeypatch)
     assert (run.summary["aborted"], run.summary["reason"]) == (
         True,
         "BrokenPipeError: nobody reads",

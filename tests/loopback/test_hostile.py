@@ -37,11 +37,11 @@ def flood(count: int, kind: str, seed: int) -> None:
     source.poll(clock.now())
     good = [any_message(rng) for _ in range(200)]
     makers = (any_message, any_message, any_message, lambda rng: mutated(rng, good), noise)
-    said = 0
-    while said < count:
+    sent = 0
+    while sent < count:
         inbox.extend(makers[rng.integers(len(makers))](rng) for _ in range(200))
-        said += 200
-        now = clock.now() + said * 1e-4
+        sent += 200
+        now = clock.now() + sent * 1e-4
         # Nobody arms: whatever comes, nothing is thrown and nothing released.
         runner.tick(now, source.poll(now), runner.backend.status(now), AutoOperator().words("idle"))
         runner.backend.service(now)
@@ -49,8 +49,8 @@ def flood(count: int, kind: str, seed: int) -> None:
     assert source._link.received > count // 2, "most must reach the listeners"
     assert not runner.errors
     harmless = ("COMMAND_LONG", mav.MAV_CMD_SET_MESSAGE_INTERVAL)
-    told = {kind for kind, number in commands if (kind, number) != harmless}
-    assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG", "PARAM_SET"}.isdisjoint(told)
+    received = {kind for kind, number in commands if (kind, number) != harmless}
+    assert {"SET_ATTITUDE_TARGET", "COMMAND_LONG", "PARAM_SET"}.isdisjoint(received)
     assert runner.backend.status(now).release != FAILED
 
 
@@ -91,7 +91,7 @@ def forger(rng, signed: bool, captured: list[bytes]):
     """Makes one packet and its sender: spoofed, stray, noise; with signing also from the vehicle's
     own address, unsigned, signed with another key, or sent once more.
     """
-    said, packers = lies(), {ids: mav.MAVLink(None, *ids) for ids in ((1, 1), (1, 25))}
+    messages, packers = lies(), {ids: mav.MAVLink(None, *ids) for ids in ((1, 1), (1, 25))}
     forged = {ids: Signed(OTHER_KEY, *ids) for ids in packers}
 
     def make():
@@ -106,8 +106,8 @@ def forger(rng, signed: bool, captured: list[bytes]):
         if kind == 2 and captured:
             return captured[rng.integers(len(captured))], who
         if kind == 3 and signed:
-            return said[rng.integers(len(said))].pack(forged[ids]), who
-        return said[rng.integers(len(said))].pack(packers[ids]), who
+            return messages[rng.integers(len(messages))].pack(forged[ids]), who
+        return messages[rng.integers(len(messages))].pack(packers[ids]), who
 
     return make
 

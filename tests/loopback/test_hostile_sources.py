@@ -32,15 +32,15 @@ def motive():
 @fixture
 def natnet(motive):
     importorskip("natnet", reason="extra natnet")
-    said = []
+    messages = []
     params = MocapParams("natnet", "127.0.0.1", multicast=False, timeout=10.0)
-    source = NatNetSource(params, IDS, time.monotonic, tell=said.append)
-    yield source, said
+    source = NatNetSource(params, IDS, time.monotonic, tell=messages.append)
+    yield source, messages
     source.close()
 
 
 def test_bad_datagrams_end_no_thread_of_natnet(motive, natnet):
-    source, said = natnet
+    source, messages = natnet
     threads = [thread for thread in threading.enumerate() if "socket_thread" in thread.name]
     assert len(threads) == 2
     good = frame(1.0, (7, (0.5, 1.0, 0.0), LEVEL, True), (8, (0.5, 0.4, 0.0), UNKNOWN, False))
@@ -68,9 +68,13 @@ def test_bad_datagrams_end_no_thread_of_natnet(motive, natnet):
     assert not payload.valid
     assert all(thread.is_alive() for thread in threads)
     assert source.failure is None
-    assert sum("does not parse" in text for text in said) >= 1
-    assert any("source.mocap.host is 127.0.0.1" in text and "127.0.0.9" in text for text in said)
-    assert any("a second sender; the Motive speaks from 127.0.0.1:1510" in text for text in said)
+    assert sum("does not parse" in text for text in messages) >= 1
+    assert any(
+        "source.mocap.host is 127.0.0.1" in text and "127.0.0.9" in text for text in messages
+    )
+    assert any(
+        "a second sender; the Motive speaks from 127.0.0.1:1510" in text for text in messages
+    )
     stranger.close()
     second.close()
 

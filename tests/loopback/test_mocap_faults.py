@@ -38,7 +38,7 @@ def spoiled(name: str):
     state.
     """
     more = ODOMETRY if name == "reset" else ()
-    plant, told = LevelPlant(), []
+    plant, decisions = LevelPlant(), []
     runner, source, clock, fake = peers(
         plant,
         overrides=(*QUICK, *more),
@@ -46,28 +46,28 @@ def spoiled(name: str):
         mocap_fault=(name, START),
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
     )
-    cut(runner, source, clock, AutoOperator(), None, START + 0.7, told.append)
-    return runner, fake, [(d.state, d.reason, d.time) for d in told]
+    cut(runner, source, clock, AutoOperator(), None, START + 0.7, decisions.append)
+    return runner, fake, [(d.state, d.reason, d.time) for d in decisions]
 
 
 @mark.parametrize("name", sorted(FAULTS))
 def test_a_fault_in_mid_throw(name):
-    runner, fake, told = spoiled(name)
-    assert when(told, "throw") < START - 0.2, "the throw goes on when the fault begins"
-    after = [(state, reason) for state, reason, time in told if time > START]
+    runner, fake, decisions = spoiled(name)
+    assert when(decisions, "throw") < START - 0.2, "the throw goes on when the fault begins"
+    after = [(state, reason) for state, reason, time in decisions if time > START]
     if name in ENDS:
         assert after[0] == ("recover", "stale poses")
-        assert when(told, "recover") == approx(START + HOLD, abs=ROOM)
+        assert when(decisions, "recover") == approx(START + HOLD, abs=ROOM)
         assert after[1][0] == "abort"
         assert "no new pose of the vehicle" in after[1][1]
-        assert when(told, "abort") == approx(START + ABORT, abs=ROOM)
+        assert when(decisions, "abort") == approx(START + ABORT, abs=ROOM)
     elif name == "payload-lost":
         assert after[0] == ("recover", "stale poses")
-        assert when(told, "recover") == approx(START + HOLD, abs=ROOM)
+        assert when(decisions, "recover") == approx(START + HOLD, abs=ROOM)
         assert "abort" not in [state for state, _ in after]
     elif name == "rare":
         assert after[0][0] == "recover"
-        assert when(told, "recover") <= START + 0.2 + HOLD + ROOM
+        assert when(decisions, "recover") <= START + 0.2 + HOLD + ROOM
         assert "throw" not in [state for state, _ in after]
     else:
         assert name in FLOWN_THROUGH

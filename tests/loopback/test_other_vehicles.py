@@ -81,18 +81,18 @@ def reverse(fake):
     fake.__class__ = type("Reversed", (type(fake),), ends)
 
 
-def require_refused(runner, said, sunk):
+def require_refused(runner, reasons, sunk):
     """Fail where a run went on, or ended when something was lost."""
-    assert (runner.machine.state, runner.machine.throws) == (State.DONE, 0), said
+    assert (runner.machine.state, runner.machine.throws) == (State.DONE, 0), reasons
     if runner.machine.flown:
-        assert runner.machine.handed_back, said
-        assert sunk < SUNK, said
+        assert runner.machine.handed_back, reasons
+        assert sunk < SUNK, reasons
 
 
 @mark.parametrize("kind", KINDS)
 def test_the_policys_vehicle_throws_even_with_a_slow_yaw(kind):
-    runner, said, sunk = fly(kind, yaw_lag=SLOW)
-    assert runner.machine.state is State.THROW, said
+    runner, reasons, sunk = fly(kind, yaw_lag=SLOW)
+    assert runner.machine.state is State.THROW, reasons
     assert sunk < SUNK
 
 
@@ -115,24 +115,24 @@ FLOWN = [
 @mark.parametrize(("name", "kind"), FLOWN)
 def test_another_vehicle_than_the_configuration_says(kind, name):
     flown, reasons = OTHERS[name]
-    runner, said, sunk = fly(kind, **flown)
-    require_refused(runner, said, sunk)
-    assert any(reason in said for reason in reasons)
+    runner, ended_by, sunk = fly(kind, **flown)
+    require_refused(runner, ended_by, sunk)
+    assert any(reason in ended_by for reason in reasons)
 
 
 @mark.parametrize("kind", KINDS)
 @mark.parametrize("axis", range(3))
 def test_the_sign_of_a_rate(kind, axis):
-    runner, said, sunk = fly(kind, spoil=turn(axis))
-    require_refused(runner, said, sunk)
-    assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in said
+    runner, reasons, sunk = fly(kind, spoil=turn(axis))
+    require_refused(runner, reasons, sunk)
+    assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in reasons
     most = AT_ONCE if runner.response.reported else BY_POSES
     assert runner.response.time <= most + 1e-9
 
 
 @mark.parametrize("kind", KINDS)
 def test_a_mechanism_that_opens_the_other_way(kind):
-    runner, said, sunk = fly(kind, spoil=reverse)
-    require_refused(runner, said, sunk)
+    runner, reasons, sunk = fly(kind, spoil=reverse)
+    require_refused(runner, reasons, sunk)
     assert not runner.machine.flown
-    assert "its ends are exchanged" in said or "where it should hang" in said
+    assert "its ends are exchanged" in reasons or "where it should hang" in reasons

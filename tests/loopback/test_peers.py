@@ -26,7 +26,7 @@ class Wire:
     """The runner's end of a link on a UDP port, and senders of any ids at others."""
 
     def __init__(self, folder, base="fake", *overrides):
-        self.now, self.said = 0.0, []
+        self.now, self.messages = 0.0, []
         self.number, self.other = free_port(), free_port()
         given = (
             f'link.device="udp:127.0.0.1:{self.number}"',
@@ -34,7 +34,7 @@ class Wire:
         )
         self.params = load_run(base, given)
         self.source, self.link, _ = open_source(
-            self.params, folder, MonotonicClock(), None, self.said.append
+            self.params, folder, MonotonicClock(), None, self.messages.append
         )
         self.backend = make_backend(self.params, self.link)
 
@@ -95,7 +95,7 @@ def test_poses_come_on_a_separate_port(wire):
     """As `ardupilot.toml` has it: the autopilot on its own device, the poses by UDP."""
     run = wire("fake", 'source.device="udp:127.0.0.1:{other}"')
     vehicle, heard = run.peer()
-    bridge, asked = run.peer(number=run.other)
+    bridge, requests = run.peer(number=run.other)
     stray = run.peer(number=run.other)[0]
     vehicle.send(beat())
     bridge.send(pose())
@@ -108,7 +108,7 @@ def test_poses_come_on_a_separate_port(wire):
     vehicle.pump(lambda: 0.0)
     bridge.pump(lambda: 0.0)
     assert ATTITUDE in heard
-    assert set(asked) <= {"TIMESYNC", "HEARTBEAT"}
+    assert set(requests) <= {"TIMESYNC", "HEARTBEAT"}
     assert len(run.source.links) == 2
 
 
@@ -131,7 +131,7 @@ def test_a_bridge_that_restarts_is_heard_again_on_the_ground_and_audited_anew(wi
     assert run.backend.audit is not audit
     second.pump(lambda: 0.0)
     assert "PARAM_REQUEST_READ" in heard
-    assert any("the autopilot speaks from" in text for text in run.said)
+    assert any("the autopilot speaks from" in text for text in run.messages)
 
 
 def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch, printed):

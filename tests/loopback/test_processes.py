@@ -39,13 +39,13 @@ before; the last one counts as it is.
 
 def end_in_throw(folder: Path):
     """Return what tells a run to end once its policy has acted for some ticks."""
-    ticks, told = folder / "ticks.jsonl", []
+    ticks, signalled = folder / "ticks.jsonl", []
 
     def watch(process: int) -> None:
         flown = ticks.is_file() and ticks.read_text().count('"action": [') >= ACTIONS
-        if flown and not told:
+        if flown and not signalled:
             os.kill(process, signal.SIGTERM)
-            told.append(process)
+            signalled.append(process)
 
     return watch
 

@@ -69,13 +69,13 @@ class OtherSide:
 
     def __init__(self, port):
         self.link = Link(UdpPort(Device("udpout", "127.0.0.1", port)), *VEHICLE_ID)
-        self.asked = set()
+        self.requested = set()
         self.link.listen(self._hear)
 
     def _hear(self, message, arrival):
         kind = message.get_type()
         if kind == "COMMAND_LONG" and message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self.asked.add(int(message.param1))
+            self.requested.add(int(message.param1))
         elif kind == "PARAM_REQUEST_READ":
             values = dict(zip(ORIGIN, (LATITUDE, LONGITUDE, ALTITUDE)))
             value = (values[message.param_id], mav.MAV_PARAM_TYPE_REAL32, 1, 0)
@@ -115,9 +115,11 @@ class OtherSide:
 @fixture
 def bridge():
     port, params = free_port(), load_run("px4").px4
-    own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
+    autopilot = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
     poses = Link(UdpPort(Device("udpout", "127.0.0.1", free_port())), *VEHICLE_ID)
-    made = Px4Sih(make_ball("vision", 0), poses, FakeMocapParams(), 0, FakeOptions(), params, own)
+    made = Px4Sih(
+        make_ball("vision", 0), poses, FakeMocapParams(), 0, FakeOptions(), params, autopilot
+    )
     made.other = OtherSide(port)
     yield made
     made.close()
@@ -130,7 +132,7 @@ def test_the_bridge_hears_places_and_the_mechanism(bridge):
     now = bridge.plant.state
     assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=0.01)
     assert_allclose(now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6)
-    assert bridge.other.asked >= {
+    assert bridge.other.requested >= {
         mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
         mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
     }

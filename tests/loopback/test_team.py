@@ -63,11 +63,11 @@ def test_both_throw_and_release_in_one_tick(pair, tmp_path):
     pair.turn(300, lambda pair: all(loop.throws for loop in pair.loops))
     releases = [[d.time for d in each if d.release] for each in pair.decisions]
     starts = [next(d.time for d in each if d.state == "throw") for each in pair.decisions]
-    asked = [next(d.time for d in each if d.ready == RELEASE) for each in pair.decisions]
+    requests = [next(d.time for d in each if d.ready == RELEASE) for each in pair.decisions]
     assert starts[0] == approx(starts[1])
     assert len(releases[0]) == len(releases[1]) == 1
     assert releases[0] == approx(releases[1])
-    assert releases[0][0] == approx(max(asked) + 0.02)
+    assert releases[0][0] == approx(max(requests) + 0.02)
     pair.turn(30)
     assert [fake.witness.releases for fake in pair.fakes] == [1, 1]
     first.recorder.close({})

@@ -141,11 +141,11 @@ def peers(
         ("aim.bound=9.0",) if loaded is not None and len(loaded.weights) == 1 else ()
     )  # it releases in hover, 2 m off
     params = load_run(CONFIGS[kind], [f"policy={policy}", *wild, *overrides])
-    here, there = pipe()
+    here, far_end = pipe()
     mine, its = pipe()
     mine.whole = its.whole = kind == "crazyflie"
     more = FakeOptions(answer=answer, **options)
-    far = Link(there, *VEHICLE_ID, key=key)
+    far = Link(far_end, *VEHICLE_ID, key=key)
     fake = load_fake(KINDS[kind])(plant, far, mocap or FakeMocapParams(), seed, more, its)
     fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
@@ -175,11 +175,11 @@ def cut(runner, source, clock, operator, recorder, seconds, tell):
 
     ``tell`` is handed the first decision of each state; what is waited for stands in those of
     `Loop` itself."""
-    said = []
+    states = []
 
     def change(decision):
-        if not said or said[-1] != decision.state:
-            said.append(decision.state)
+        if not states or states[-1] != decision.state:
+            states.append(decision.state)
             tell(decision)
 
     loop, begin = Loop(runner, source, clock, operator, recorder, change), clock.now()
@@ -195,6 +195,8 @@ def throw(plant, seconds=20.0, recorder=None, phase=0, operator=None, **kwargs):
     runner, source, clock, fake = peers(plant, **kwargs)
     for _ in range(phase):
         fake.step()
-    told = []
-    summary = cut(runner, source, clock, operator or AutoOperator(), recorder, seconds, told.append)
-    return summary, fake, told
+    decisions = []
+    summary = cut(
+        runner, source, clock, operator or AutoOperator(), recorder, seconds, decisions.append
+    )
+    return summary, fake, decisions

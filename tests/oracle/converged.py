@@ -61,8 +61,8 @@ def converged(
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data = initial_data(model, scene)
-    asked = (scene.duration,) if times is None else times
-    records = [round(t / step) for t in asked]
+    instants = (scene.duration,) if times is None else times
+    records = [round(t / step) for t in instants]
     switches = {round(w.t_start / step): w for w in scene.schedule}
     rows = []
     now = 0

@@ -85,9 +85,9 @@ def test_extension_is_the_reference_plants(name):
     of_rope = name in ("payload_drag", "wind", "drag in wind")
     plain = fine(changed(paper_plant(), {"rope.segments": 5 if of_rope else 1}))
     extended = changed(plain, CASES[name])
-    there = swing(extended, ReferenceExtras(payload_drag=extended.rope.payload_drag))
+    expected = swing(extended, ReferenceExtras(payload_drag=extended.rope.payload_drag))
     here = swing(extended)
-    assert np.abs(here - there).max() < AGREEMENT
+    assert np.abs(here - expected).max() < AGREEMENT
     assert np.abs(swing(plain) - here).max() > DISTINCT * AGREEMENT
 
 
@@ -103,24 +103,24 @@ def let_go(plant):
     )
     weight = GRAVITY * plant.total_mass
     command, home = np.array([[weight, 0.0, 0.0, 0.0]]), np.array([[0.0, 0.0, 1.5]])
-    here, there = (
+    here, reference = (
         HybridSim(plant, 1, extensions=EVERYTHING),
         ReferencePlant(plant, step=REFERENCE_STEP),
     )
     here.place(pos_w=home, cable_dir_w=tilt)
-    there.reset(home, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, tilt)
+    reference.reset(home, np.array([[0.0, 0.0, 0.0, 1.0]]), still, still, tilt)
     k = 0
     while not here.get("separated")[0]:
         here.set_command(command, np.array([int(k >= 3)]))
         here.step()
-        there.step(command, k >= 3)
+        reference.step(command, k >= 3)
         k += 1
     opened = (
         0.02 * (k - 1) + float(here.get("separation_time")[0]),
-        float(there.landing.separation_time[0]),
+        float(reference.landing.separation_time[0]),
     )
     fallen = np.array([0.0, 0.0, GRAVITY]) * (0.02 * k - opened[1])
-    return opened, (here.get("payload_vel_w")[0], there.state.payload_vel_w[0] + fallen)
+    return opened, (here.get("payload_vel_w")[0], reference.state.payload_vel_w[0] + fallen)
 
 
 def test_release_by_pull_and_kick_are_the_reference_plants():

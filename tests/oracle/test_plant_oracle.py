@@ -16,7 +16,7 @@ from sim.reference.plant import ReferencePlant
 from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor, numerics, random_commands
 
-COUNT, ASKED_AT = 4, 12
+COUNT, RELEASE_STEP = 4, 12
 """Environments; step at which every second one asks for the release."""
 USUAL = {"rope.segments": 1, "vehicle.queue.delay": 0.0213, "release.lag": 0.1037}
 """A delay and a lag that fall inside substeps. `test_chain_oracle` flies all segments."""
@@ -70,7 +70,7 @@ def test_whole_plant(name):
         sims[precision].place(pos, vel_w=vel)
         separation[precision] = np.full(COUNT, np.nan)
     for k, command in enumerate(random_commands(0, steps, COUNT)):
-        release = RELEASE & (k == ASKED_AT)
+        release = RELEASE & (k == RELEASE_STEP)
         reference.step(command, release)
         for precision, sim in sims.items():
             sim.set_command(command, release)
@@ -104,5 +104,5 @@ def test_orders_of_the_integrators_without_a_rope():
 
     for integrator, order in (("euler", 1.0), ("rk4", 4.0)):
         ends = [end(integrator, h) for h in (1e-3, 5e-4, 2.5e-4)]
-        seen = np.log2(norm(ends[0] - ends[1]) / norm(ends[1] - ends[2]))
-        assert seen == approx(order, abs=0.35)
+        measured = np.log2(norm(ends[0] - ends[1]) / norm(ends[1] - ends[2]))
+        assert measured == approx(order, abs=0.35)

@@ -48,7 +48,7 @@ REASONS = {
     "it opens a window",
     "a cluster",
 }
-SEEN = ("tests", "configs", "docs")
+READABLE = ("tests", "configs", "docs")
 """Folders of the repository that a page's commands may read."""
 FENCE = re.compile(
     r'((?:<!--[^\n]*-->\n+)*)^```(\w*)(?: title="([^"\n]+)")?[^\n]*\n(.*?)^```[ \t]*$',
@@ -122,7 +122,7 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
     blocks = []
     for match in FENCE.finditer(text):
         place = text.count("\n", 0, match.start(2)) + 1
-        reason, terminals, extra = _said(match[1], f"{name}:{place}")
+        reason, terminals, extra = _parse_comments(match[1], f"{name}:{place}")
         if not match[2]:
             raise ValueError(
                 f"{name}:{place}: a fence without a language: sh, python, toml, ..., or text for"
@@ -138,7 +138,7 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
     return blocks
 
 
-def _said(comments: str, place: str) -> tuple[str, bool, dict[str, tuple[str, ...]]]:
+def _parse_comments(comments: str, place: str) -> tuple[str, bool, dict[str, tuple[str, ...]]]:
     reason, terminals, extra = "", False, {}
     for comment in re.findall(r"<!-- *(.*?) *-->", comments):
         if match := re.fullmatch(r"not run: (.*)", comment):
@@ -178,7 +178,7 @@ class Runner:
         """
         folder = self.work / re.sub(r"\W", "_", blocks[0].page)
         folder.mkdir()
-        for name in SEEN:
+        for name in READABLE:
             (folder / name).symlink_to(ROOT / name)
         spoken = " ".join(block.text for block in blocks if block.language in ("sh", "python"))
         files = " ".join(block.text for block in blocks if block.title)
@@ -331,7 +331,7 @@ def _files() -> set[tuple[str, int]]:
     return {
         (str(path), path.stat().st_mtime_ns)
         for path in Path().rglob("*")
-        if path.is_file() and path.parts[0] not in SEEN
+        if path.is_file() and path.parts[0] not in READABLE
     }
 
 
@@ -341,7 +341,9 @@ def _digest(jobs: list[list[str]]) -> str:
     """
     spoken, named = repr(jobs), []
     files = [
-        path for path in sorted(Path().rglob("*.*")) if path.is_file() and path.parts[0] not in SEEN
+        path
+        for path in sorted(Path().rglob("*.*"))
+        if path.is_file() and path.parts[0] not in READABLE
     ]
     while more := [path for path in files if path not in named and str(path) in spoken]:
         named += more

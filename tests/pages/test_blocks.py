@@ -49,7 +49,7 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
 
 
 @mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("```sh\nfalse\n```\n", "status 1"),
         ("```sh\nvisthrow config vehicle nobody\n```\n", "status 2"),
@@ -68,13 +68,13 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
         ),
     ],
 )
-def test_what_does_not_run_fails(tmp_path, text, said):
-    with raises((AssertionError, SystemExit), match=said):
+def test_what_does_not_run_fails(tmp_path, text, message):
+    with raises((AssertionError, SystemExit), match=message):
         run(tmp_path, text)
 
 
 @mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("<!-- not run: no idea -->\n```sh\nfalse\n```\n", "no reason"),
         ("```\nvisthrow fly\n```\n", "without a language"),
@@ -83,10 +83,10 @@ def test_what_does_not_run_fails(tmp_path, text, said):
         ("```sh\nfalse\n", "not closed"),
     ],
 )
-def test_what_hides_a_block_fails(tmp_path, text, said):
+def test_what_hides_a_block_fails(tmp_path, text, message):
     page = tmp_path / "page.md"
     page.write_text(text)
-    with raises(ValueError, match=said):
+    with raises(ValueError, match=message):
         blocks_of(page, root=tmp_path)
 
 

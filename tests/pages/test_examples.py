@@ -111,11 +111,13 @@ def test_a_detector_finds_what_its_network_says(monkeypatch):
     camera = load_experiment("state").camera
     picture = np.zeros((camera.fisheye.height, camera.fisheye.width, 3), np.uint8)
     lens = Fisheye(camera.fisheye)
-    seen = images.DETECTORS["mine"](lens, camera.payload_radius, camera.goal_side).detect(picture)
+    detected = images.DETECTORS["mine"](lens, camera.payload_radius, camera.goal_side).detect(
+        picture
+    )
     left, right = program["network"](picture)[1][::2]
-    (u, _), _ = lens.project(torch.tensor(seen.ball.ray_c))
+    (u, _), _ = lens.project(torch.tensor(detected.ball.ray_c))
     assert float(u) == approx((left + right) / 2, abs=0.5)
-    assert seen.goal.rays_c.shape == (4, 3)
+    assert detected.goal.rays_c.shape == (4, 3)
 
 
 def test_every_example_is_short_and_run():

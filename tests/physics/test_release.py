@@ -19,11 +19,11 @@ def plant(lag: float) -> PlantParams:
     return changed(paper_plant(), {"release.lag": lag})
 
 
-def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
+def thrown(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict]:
     """Outputs of every step; the release is asked for at one step only."""
     rows = []
     for k, command in enumerate(commands):
-        sim.set_command(command, np.full(sim.count, k == asked_at))
+        sim.set_command(command, np.full(sim.count, k == release_step))
         sim.step()
         names = (
             "separated",
@@ -42,17 +42,17 @@ def test_the_latch_keeps_and_the_lag_is_exact(lag):
     """Asked for once, at the start of step 3; separation follows by itself, in the right step and
     at the right time.
     """
-    asked_at, count = 3, 2
+    release_step, count = 3, 2
     sim = HybridSim(plant(lag), count)
-    rows = thrown(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), asked_at)
+    rows = thrown(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), release_step)
     times = [k for k, row in enumerate(rows) if np.any(row["separated"])]
     assert len(times) == 1
     (step,) = times
-    since = (step - asked_at) * PERIOD + rows[step]["separation_time"]
+    since = (step - release_step) * PERIOD + rows[step]["separation_time"]
     assert_allclose(since, lag, atol=CLOCK)
     for k, row in enumerate(rows):
         assert np.all(row["attached"] == (k < step))
-        assert np.all(row["release_timer"] < 0.0) == (k < asked_at)
+        assert np.all(row["release_timer"] < 0.0) == (k < release_step)
 
 
 def test_asking_again_or_no_more_changes_nothing():

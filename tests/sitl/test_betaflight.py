@@ -229,9 +229,9 @@ def test_it_is_taken_armed_and_follows_steps(stiff):
         first = len(bench.rows)
         bench.turn(0.3, (share * hover[0], 0.0, 0.0, 0.0))
         force = np.array(bench.rows[first:])[-25:, 4].mean()
-        asked = share * hover[0] / bench.plant.mass[0]
-        print(f"thrust x {share}: {force:.2f} of {asked:.2f} m/s^2")
-        assert force == approx(asked, rel=LIFT)
+        expected = share * hover[0] / bench.plant.mass[0]
+        print(f"thrust x {share}: {force:.2f} of {expected:.2f} m/s^2")
+        assert force == approx(expected, rel=LIFT)
 
 
 def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
@@ -248,8 +248,8 @@ def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
     plant.rate_b, plant.step = np.zeros(3), turned
     bench.turn(RAMP, hover)
     time = plant.period * (np.arange(len(rows)) + 0.5)
-    seen = time > SETTLED
-    _, slope, offset = np.polyfit(time[seen], np.array(rows)[seen], 2)
+    settled = time > SETTLED
+    _, slope, offset = np.polyfit(time[settled], np.array(rows)[settled], 2)
     print(f"\nlead {1e3 * offset / slope:.2f} ms, {1e3 * LEAD:.2f} by the settings")
     assert offset / slope == approx(LEAD, rel=0.05)
 
@@ -317,12 +317,12 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     switches off, as the version's row of the table of facts says.
     """
     found = override.killed(program(), tmp_path, state)
-    told, expires = found["killed"], found["version"] >= EXPIRES - 1e-6
-    print(f"\n{found['version']:g}, {state}: {told}")
-    assert (told["expired"] is not None) == expires
+    sticks, expires = found["killed"], found["version"] >= EXPIRES - 1e-6
+    print(f"\n{found['version']:g}, {state}: {sticks}")
+    assert (sticks["expired"] is not None) == expires
     if expires:
-        assert told["expired"] == approx(FACTS["override_window"], abs=0.1)
-    assert told["back"] < 0.2, "the pilot's switch gives the sticks back"
+        assert sticks["expired"] == approx(FACTS["override_window"], abs=0.1)
+    assert sticks["back"] < 0.2, "the pilot's switch gives the sticks back"
 
 
 WAYS = [("SIGINT", "armed"), ("SIGINT twice", "armed")]
@@ -370,12 +370,12 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
 
 def wait_for(process, words):
     """Read what a process says up to a line with these words."""
-    said = []
+    lines = []
     for line in process.stderr:
-        said.append(line)
+        lines.append(line)
         if words in line:
             return
-    pytest.fail("".join(said[-30:]))
+    pytest.fail("".join(lines[-30:]))
 
 
 def bridged(folder, report, *more):
@@ -402,7 +402,7 @@ def test_a_whole_throw(tmp_path):
     try:
         wait_for(bridge, "it flies")
         runner = running(tmp_path / "run", "realtime.priority=10")
-        told, states = runner.communicate(timeout=LONG)
+        output, states = runner.communicate(timeout=LONG)
         bridge.communicate(timeout=LONG)
     finally:
         bridge.kill()
@@ -415,7 +415,7 @@ def test_a_whole_throw(tmp_path):
         f"\nlanding error {error:.3f} m, {100 * late:.1f} % of the periods late, loop"
         f" {found['loop_us']:.0f} us, {lag:.3f} s"
     )
-    print(told.splitlines()[0])
+    print(output.splitlines()[0])
     assert found["releases"] == 1
     assert error < MISS, states
     assert "recover" in states

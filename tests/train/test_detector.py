@@ -152,12 +152,12 @@ def test_a_throw_is_refused_where_the_hover_does_not_see(name):
 
 
 @mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["throw", "--policy", "state"], "a vision policy"),
         (["throw", "--plant", "hal"], "no plant 'hal'"),
         (["train", "nothing"], "no detector config 'nothing'"),
     ],
 )
-def test_what_cannot_be_done_is_refused(refused, words, said):
-    refused("detector", *words, said=said)
+def test_what_cannot_be_done_is_refused(refused, words, message):
+    refused("detector", *words, message=message)

@@ -133,9 +133,9 @@ def test_the_exported_policy_remembers_as_the_network_does(whole):
     with torch.no_grad():
         estimates = network(obs)
     memory = policy.begin(5)
-    for seen, wanted in zip(obs, estimates):
-        estimate, memory = policy.estimator.step(seen, memory)
-        assert_close(estimate, wanted, rtol=0, atol=AGREES)
+    for observation, expected in zip(obs, estimates):
+        estimate, memory = policy.estimator.step(observation, memory)
+        assert_close(estimate, expected, rtol=0, atol=AGREES)
 
 
 def test_the_pilot_remembers_as_training_does(whole):
@@ -146,7 +146,7 @@ def test_the_pilot_remembers_as_training_does(whole):
     policy = Policy.load(whole / "policy.npz")
     env, pilot = ThrowEnv(experiment, "cpu", 3, 3), Pilot(policy, experiment.camera, 3)
     for _ in range(2):
-        seen, act = env.reset()["actor"], policy.actor(3)
+        observation, act = env.reset()["actor"], policy.actor(3)
         pilot.start()
         for _ in range(8):
             state = {key: value.numpy().copy() for key, value in env.views.state.items()}
@@ -157,9 +157,9 @@ def test_the_pilot_remembers_as_training_does(whole):
                 env.views.goal_w.numpy().copy(),
                 state["attached"],
             )
-            action = act(seen)
+            action = act(observation)
             np.testing.assert_allclose(out.action, action.clamp(-1.0, 1.0).numpy(), atol=AGREES)
-            seen = env.carry(action)["actor"]
+            observation = env.carry(action)["actor"]
 
 
 def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, refused):
@@ -170,7 +170,7 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     for name, value in policy.estimator.parts().items():
         assert_close(taken.estimator.parts()[name], value, rtol=0, atol=AGREES)
     memory = [*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']
-    refused(*memory, said="the policy is one with a memory")
+    refused(*memory, message="the policy is one with a memory")
     # as it was trained
     late = (
         "task.observation.latency=[0.004,0.04]",
@@ -178,17 +178,17 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
         "task.observation.response=8",
     )
     without = [*words(tmp_path / "b"), "--from", "vision_located", *overrides(*late)]
-    refused(*without, said="the policy is one without a memory")
+    refused(*without, message="the policy is one without a memory")
 
 
 @mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ('distillation.teacher="vision"', "has the layout 'vision'; expected 'state'"),
         ('task.observation.layout="state"', 'observation.layout = "vision"'),
         ("distillation.memory=0", "memory"),
     ],
 )
-def test_what_cannot_be_distilled_is_refused(tmp_path, refused, change, said):
-    refused(f"train vision --device cpu --out {tmp_path}/run", *overrides(change), said=said)
+def test_what_cannot_be_distilled_is_refused(tmp_path, refused, change, message):
+    refused(f"train vision --device cpu --out {tmp_path}/run", *overrides(change), message=message)
     assert not (tmp_path / "run").exists()

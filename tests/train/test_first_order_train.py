@@ -43,15 +43,15 @@ def test_its_policy_is_one_like_any_other(tmp_path):
 
 
 @mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("first_order.horizon=5", "expected at least 7"),
         ("task.target.speed=[0.0,0.5]", "stand still"),
         ('task.observation.layout="vision"', 'layout = "state"'),
     ],
 )
-def test_what_it_cannot_train_is_refused(tmp_path, refused, change, said):
-    refused(*words(tmp_path / "a", "--set", change), said=said)
+def test_what_it_cannot_train_is_refused(tmp_path, refused, change, message):
+    refused(*words(tmp_path / "a", "--set", change), message=message)
 
 
 @mark.gpu

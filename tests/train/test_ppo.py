@@ -21,7 +21,7 @@ from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
 
-ENVIRONMENTS, STEPS, SEEN, KNOWN, ACTIONS = 32, 8, 7, 9, 5
+ENVIRONMENTS, STEPS, ACTOR_INPUTS, CRITIC_INPUTS, ACTIONS = 32, 8, 7, 9, 5
 
 SAME = {"rtol": 2e-4, "atol": 2e-6}
 """Float32 sums in another order, over some twenty steps of Adam, whose first ones divide by a
@@ -53,16 +53,16 @@ def params(**changes) -> PPOParams:
 
 def observations(device: str = "cpu") -> TensorDict:
     drawn = {
-        "actor": 2.0 * torch.randn(ENVIRONMENTS, SEEN) + 1.0,
-        "critic": torch.randn(ENVIRONMENTS, KNOWN),
+        "actor": 2.0 * torch.randn(ENVIRONMENTS, ACTOR_INPUTS) + 1.0,
+        "critic": torch.randn(ENVIRONMENTS, CRITIC_INPUTS),
     }
     return TensorDict(drawn, batch_size=[ENVIRONMENTS]).to(device)
 
 
-def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
+def build(p: PPOParams, ours: bool, device: str = "cpu") -> PPO:
     """Our algorithm or rsl_rl's with rsl_rl's networks, from the same weights."""
     cfg = rsl_rl_config(p, Ranks(device))
-    if not own:
+    if not ours:
         cfg["algorithm"]["class_name"] = "PPO"
         del cfg["algorithm"]["muon"]
         for name in ("actor", "critic"):
@@ -105,7 +105,7 @@ def iterate(alg: PPO, seed: int) -> dict[str, float]:
 )
 def test_the_update_is_rsl_rls(changes):
     p = params(**changes)
-    ours, theirs = build(p, own=True), build(p, own=False)
+    ours, theirs = build(p, ours=True), build(p, ours=False)
     assert isinstance(ours, CapturedPPO)
     assert not isinstance(theirs, CapturedPPO)
     start = [w.detach().clone() for w in ours.actor.parameters()]
@@ -127,7 +127,8 @@ def test_products_in_bfloat16_follow_those_in_float32():
     some ten times as far.
     """
     plain, short = (
-        build(params(schedule="fixed", products=kind), own=True) for kind in ("float32", "bfloat16")
+        build(params(schedule="fixed", products=kind), ours=True)
+        for kind in ("float32", "bfloat16")
     )
     start = [w.detach().clone() for w in plain.actor.parameters()]
     for seed in range(3):
@@ -151,7 +152,7 @@ def test_the_sample_is_the_gaussians():
 
 
 def test_the_critic_learns_alone_while_the_actor_is_held():
-    alg = build(params(), own=True)
+    alg = build(params(), ours=True)
     alg.actor_learns.zero_()
     held, moving = (
         [w.detach().clone() for w in model.parameters()] for model in (alg.actor, alg.critic)
@@ -164,7 +165,7 @@ def test_the_critic_learns_alone_while_the_actor_is_held():
 
 
 def test_a_rollout_keeps_the_memory_that_a_captured_update_reads():
-    alg = build(params(), own=True)
+    alg = build(params(), ours=True)
     kept, places = alg.storage, []
     for count in (0, 1):
         iterate(alg, count)
@@ -174,7 +175,7 @@ def test_a_rollout_keeps_the_memory_that_a_captured_update_reads():
 
 
 def test_a_state_that_was_saved_goes_on_the_same():
-    first, second = build(params(), own=True), build(params(), own=True)
+    first, second = build(params(), ours=True), build(params(), ours=True)
     iterate(first, 0)
     second.load_state_dict(copy.deepcopy(first.state_dict()))
     assert second.learning_rate == first.learning_rate != params().learning_rate
@@ -195,8 +196,8 @@ class Reach:
 
     def draw(self) -> TensorDict:
         self.goal = 1.6 * torch.rand(self.num_envs, ACTIONS) - 0.8
-        seen = {"actor": self.goal, "critic": self.goal}
-        self.observations = TensorDict(seen, batch_size=[self.num_envs])
+        groups = {"actor": self.goal, "critic": self.goal}
+        self.observations = TensorDict(groups, batch_size=[self.num_envs])
         return self.observations.clone()
 
     def get_observations(self) -> TensorDict:
@@ -226,10 +227,12 @@ def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], lis
         training.collect(i / iterations)
         training.learn(i / iterations)
         targets.append(float(training.alg.target_kl))
-    seen = training.env.draw()
+    observations = training.env.draw()
     with torch.inference_mode():
         networks = (training.network, training.average.module)
-        off = [float((n(seen) - seen["actor"]).norm(dim=-1).mean()) for n in networks]
+        off = [
+            float((n(observations) - observations["actor"]).norm(dim=-1).mean()) for n in networks
+        ]
     return off, targets
 
 
@@ -255,7 +258,7 @@ def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
 def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
     """Five iterations: the first launches, the second captures, three replay."""
     p = params(products=products, schedule="fixed")
-    captured, launched, theirs = (build(p, own, "cuda:0") for own in (True, True, False))
+    captured, launched, theirs = (build(p, ours, "cuda:0") for ours in (True, True, False))
     for seed in range(5):
         launched.descend = launched._epochs
         figures = [iterate(alg, seed) for alg in (captured, launched, theirs)]
@@ -275,7 +278,9 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
 @mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_rate_of_a_captured_update_is_rsl_rls():
     for kl in (1e-5, 1.0):
-        ours, theirs = (build(params(desired_kl=kl), own, "cuda:0") for own in (True, False))
+        ours, theirs = (
+            build(params(desired_kl=kl), is_ours, "cuda:0") for is_ours in (True, False)
+        )
         for seed in range(4):
             iterate(ours, seed)
             iterate(theirs, seed)

@@ -149,10 +149,11 @@ def test_minutes_leave_a_policy(tmp_path, capsys):
     assert train(folder, "--minutes", "1e-6") == 0, "what was asked for was done: a script goes on"
     assert iterations_of(folder) == [1]
     assert Policy.load(folder / "policy.npz").made_by["figures"]["iterations"] == 1
-    told = capsys.readouterr()
-    assert "success" not in told.out
+    printed = capsys.readouterr()
+    assert "success" not in printed.out
     assert (
-        "the time is over after iteration 1 of 4; go on with: visthrow train --resume" in told.err
+        "the time is over after iteration 1 of 4; go on with: visthrow train --resume"
+        in printed.err
     )
 
 
@@ -178,7 +179,7 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
 
 
 @mark.parametrize(
-    ("extra", "said"),
+    ("extra", "message"),
     [
         (["--iterations", "-3"], "--iterations -3"),
         (["--evaluate-every", "-1"], "--evaluate-every -1"),
@@ -192,8 +193,10 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
         (["--from", "vision"], "observation.layout"),
     ],
 )
-def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(tmp_path, refused, extra, said):
-    refused(*words(tmp_path / "a", *extra), said=said)
+def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(
+    tmp_path, refused, extra, message
+):
+    refused(*words(tmp_path / "a", *extra), message=message)
     assert not (tmp_path / "a").exists()
 
 
@@ -230,7 +233,7 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
 
 
 @mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             lambda f: (f / CHECKPOINT).write_bytes((f / CHECKPOINT).read_bytes()[:1000]),
@@ -245,21 +248,21 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
         ),
     ],
 )
-def test_broken_checkpoints_are_refused(tmp_path, refused, change, said):
+def test_broken_checkpoints_are_refused(tmp_path, refused, change, message):
     folder = tmp_path / "run"
     assert train(folder, "--iterations", "1") == 0
     change(folder)
-    refused(*words(folder, "--resume"), said=said)
+    refused(*words(folder, "--resume"), message=message)
 
 
 def test_resume_under_another_seed_or_configuration_is_refused(tmp_path, refused):
     folder = tmp_path / "run"
     assert train(folder, "--iterations", "1") == 0
-    refused(*words(folder, "--resume", "--seed", "2"), said="another seed, 1")
-    refused(*words(folder, "--resume", "--set", "ppo.clip=0.3"), said="another configuration")
+    refused(*words(folder, "--resume", "--seed", "2"), message="another seed, 1")
+    refused(*words(folder, "--resume", "--set", "ppo.clip=0.3"), message="another configuration")
     refused(
         f"train vision --resume --out {folder} --device cpu",
-        said="another configuration than vision",
+        message="another configuration than vision",
     )
 
 

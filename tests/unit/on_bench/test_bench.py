@@ -81,4 +81,4 @@ def test_records_refuse_what_they_are_not(kept):
 
 
 def test_mistakes_are_reported(refused):
-    refused("bench records no_such_record", said="no record")
+    refused("bench records no_such_record", message="no record")

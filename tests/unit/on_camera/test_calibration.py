@@ -100,18 +100,18 @@ def test_field_of_view_without_the_key(tmp_path):
 
 @mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
 def test_the_place_of_the_imu_is_the_mount(tmp_path, key):
-    path, there = tmp_path / "kalibr.yaml", MountParams((0.03, 0.01, -0.02), (3.0, -20.0, 40.0))
+    path, expected = tmp_path / "kalibr.yaml", MountParams((0.03, 0.01, -0.02), (3.0, -20.0, 40.0))
     text = LENSES["kalibr"]["text"]
     path.write_text(text)
     assert files.read_mount(path) is None
     matrix = np.eye(4)
-    matrix[:3, :3] = nominal_rot_cb(there).numpy()
-    matrix[:3, 3] = -matrix[:3, :3] @ there.position_b
+    matrix[:3, :3] = nominal_rot_cb(expected).numpy()
+    matrix[:3, 3] = -matrix[:3, :3] @ expected.position_b
     matrix = matrix if key == "T_cam_imu" else np.linalg.inv(matrix)
     path.write_text(f"{text}  {key}: {matrix.tolist()}\n")
     mount = files.read_mount(path)
-    assert mount.position_b == approx(there.position_b)
-    assert mount.rpy_deg == approx(there.rpy_deg)
+    assert mount.position_b == approx(expected.position_b)
+    assert mount.rpy_deg == approx(expected.rpy_deg)
     path.write_text(f"{text}  {key}: {(2.0 * matrix).tolist()}\n")
     with raises(ValueError, match="no rotation"):
         files.read_mount(path)
@@ -133,9 +133,9 @@ def test_real_basalt_files_fit(name, camera):
     grid = np.stack(
         np.meshgrid(np.linspace(0, p.width - 1, 40), np.linspace(0, p.height - 1, 40)), -1
     ).reshape(-1, 2)
-    rays, seen = lenses[0].unproject(torch.from_numpy(grid))
+    rays, visible = lenses[0].unproject(torch.from_numpy(grid))
     pixels, _ = lenses[1].project(rays)
-    before = seen & (rays[:, 2] > 0.0)
+    before = visible & (rays[:, 2] > 0.0)
     assert (pixels - torch.from_numpy(grid)).norm(dim=-1)[before].mean() < MODELS_AGREE_PX
 
 

@@ -72,11 +72,11 @@ def known() -> Prior:
     return Prior((CAMERA.rot_cb @ ROT[0].T)[:, 2].numpy(), float(eye[2]), (0.25, 0.6))
 
 
-def off(seen: FrameDetections) -> np.ndarray:
+def off(detected: FrameDetections) -> np.ndarray:
     """How far the keypoints are from the true ones [px], shape (8,)."""
     true, valid = keypoints(CAMERA, POS, ROT, GOAL, BALL)
     assert valid.all()
-    found, ok = convert_to_training_keypoints(CAMERA, seen, ROT[0].numpy())
+    found, ok = convert_to_training_keypoints(CAMERA, detected, ROT[0].numpy())
     assert ok.all()
     pixels = [CAMERA.fisheye.denormalize(points.double()).numpy() for points in (found, true[0])]
     return norm(pixels[0] - pixels[1], axis=1)
@@ -120,26 +120,26 @@ def cover(image):
 )
 def test_ball_and_goal_are_found_under_each_nuisance(scene, nuisance, worst):
     frame = np.round(np.clip(nuisance(scene), 0.0, 255.0)).astype(np.uint8)
-    seen = DETECTOR.detect(frame, known())
-    assert seen.ball is not None
-    assert seen.goal is not None
-    assert off(seen).max() < worst
+    detected = DETECTOR.detect(frame, known())
+    assert detected.ball is not None
+    assert detected.goal is not None
+    assert off(detected).max() < worst
     assert DETECTOR.detect(frame).ball is not None, "known things only narrow"
 
 
 def test_the_ball_is_as_far_away_as_its_size_says(scene):
-    seen = DETECTOR.detect(scene)
+    detected = DETECTOR.detect(scene)
     eye = POS[0] + ROT[0] @ CAMERA.position_b
     ball_c = (CAMERA.rot_cb @ ROT[0].T @ (BALL[0] - eye)).numpy()
-    distance = 0.033 / math.sin(seen.ball.half_angle)
+    distance = 0.033 / math.sin(detected.ball.half_angle)
     assert distance == approx(norm(ball_c), rel=0.05)
-    assert math.acos(seen.ball.ray_c @ ball_c / norm(ball_c)) < 0.5 / LENS.fx
+    assert math.acos(detected.ball.ray_c @ ball_c / norm(ball_c)) < 0.5 / LENS.fx
 
 
 def test_what_only_resembles_them_is_refused(cluttered):
-    seen = DETECTOR.detect(cluttered, known())
-    assert seen.goal is None, "no rim"
-    assert seen.ball is None, "not round"
+    detected = DETECTOR.detect(cluttered, known())
+    assert detected.goal is None, "no rim"
+    assert detected.ball is None, "not round"
 
 
 def test_known_things_narrow_the_search(scene):

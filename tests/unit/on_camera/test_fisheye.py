@@ -32,9 +32,9 @@ def test_round_trip_up_to_the_field_of_view(params):
     lens = Fisheye(params)
     rays = sphere(lens.half_fov - 1e-12)
     pixels, valid = lens.project(3.7 * rays)
-    back, seen = lens.unproject(pixels)
+    back, visible = lens.unproject(pixels)
     assert valid.all()
-    assert seen.all()
+    assert visible.all()
     assert angle_between(back, rays).max() < ANGLE_TOLERANCE
     assert torch.allclose(
         back.norm(dim=-1), torch.ones(len(rays), dtype=torch.float64), atol=EDGE_TOLERANCE
@@ -124,9 +124,9 @@ def test_a_point_behind_the_field_of_view_is_never_valid(params):
     theta = torch.atan2(points[:, :2].norm(dim=-1), points[:, 2])
     outside = theta > lens.half_fov + 1e-9
     _, valid = lens.project(points)
-    normalized, seen = lens.project_normalized(points)
+    normalized, visible = lens.project_normalized(points)
     assert not valid[outside].any()
-    assert not seen[outside].any()
+    assert not visible[outside].any()
     assert (valid[~outside]).all()
     assert (normalized[outside].norm(dim=-1) > 1.0).all(), (
         "the map must stay one-to-one past the field of view"

@@ -58,9 +58,9 @@ def followed(rots, rays, blind, seed=0):
         ball = (
             None if i in blind else BallSeen(noisy / norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
         )
-        seen = following.take(FrameDetections(ball, None), rot, stamp)
+        detected = following.take(FrameDetections(ball, None), rot, stamp)
         angle = lambda of: math.acos(min(1.0, float(of @ rot.T @ ray)))  # noqa: E731, B023
-        read.append(math.nan if seen.ball is None else angle(seen.ball.ray_c))
+        read.append(math.nan if detected.ball is None else angle(detected.ball.ray_c))
         off.append(angle(known.ball_ray_c))
         within.append(known.ball_within)
     return np.array(read), np.array(off), np.array(within)
@@ -93,10 +93,10 @@ def test_a_ball_is_where_it_is_looked_for():
 def test_what_is_lost_for_long_is_not_visible():
     rots, rays = throw()
     read, _, within = followed(rots, rays, range(10, 40))
-    seen = ~np.isnan(read)
-    assert seen[10:13].all()
-    assert not seen[22:].any()
-    np.testing.assert_array_equal(seen[10:], within[10:] < GATE * LOST)
+    visible = ~np.isnan(read)
+    assert visible[10:13].all()
+    assert not visible[22:].any()
+    np.testing.assert_array_equal(visible[10:], within[10:] < GATE * LOST)
 
 
 def square(rot, place, score, eye=EYE):
@@ -118,7 +118,7 @@ def goals(frames, eyes=None):
     `PERIOD`; None: missed.
     """
     rots, _ = throw(len(frames))
-    following, told = BallGoalTracker(RADIUS, SIDE), []
+    following, scores = BallGoalTracker(RADIUS, SIDE), []
     for i, (rot, frame) in enumerate(zip(rots, frames)):
         eye = EYE if eyes is None else eyes[i]
         following.prior(rot, rot[:, 2], eye, None, i * PERIOD)
@@ -126,8 +126,8 @@ def goals(frames, eyes=None):
         goal = following.take(
             FrameDetections(None, squares[0] if squares else None, squares), rot, i * PERIOD
         ).goal
-        told.append(None if goal is None else goal.score)
-    return told
+        scores.append(None if goal is None else goal.score)
+    return scores
 
 
 def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed():
@@ -149,7 +149,7 @@ def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed(
     assert following.prior(rot, rot[:, 2], eye, None, 5.0 + MEMORY).goal_ray_c is None
 
 
-HERE, THERE = (2.0, 0.0), (0.7, 1.4)
+GOAL, DECOY = (2.0, 0.0), (0.7, 1.4)
 """Places of the goal and of another square [m]."""
 
 
@@ -158,17 +158,17 @@ def test_another_square_is_not_the_goal_in_the_frames_where_it_looks_likelier():
     then, or the only one that is found.
     """
     looks = [
-        ((HERE, 0.74), (THERE, 0.57)),
-        ((HERE, 0.56), (THERE, 0.71)),
-        ((HERE, 0.82),),
-        ((THERE, 0.6),),
-        ((HERE, 0.81), (THERE, 0.72)),
+        ((GOAL, 0.74), (DECOY, 0.57)),
+        ((GOAL, 0.56), (DECOY, 0.71)),
+        ((GOAL, 0.82),),
+        ((DECOY, 0.6),),
+        ((GOAL, 0.81), (DECOY, 0.72)),
     ]
     assert goals([looks[0], *looks]) == [0.74, 0.74, 0.56, 0.82, None, 0.81]
 
 
 def test_what_looked_likelier_first_is_not_the_goal_for_ever():
-    assert goals([((HERE, 0.7), (THERE, 0.75)), *[((HERE, 0.8), (THERE, 0.6))] * 2]) == [
+    assert goals([((GOAL, 0.7), (DECOY, 0.75)), *[((GOAL, 0.8), (DECOY, 0.6))] * 2]) == [
         0.75,
         0.8,
         0.8,
@@ -176,12 +176,12 @@ def test_what_looked_likelier_first_is_not_the_goal_for_ever():
 
 
 def test_a_goal_is_found_again_where_it_was_carried():
-    told = goals([((HERE, 0.9),)] * 100 + [((THERE, 0.9),)] * 100)
-    assert told[:100] == [0.9] * 100
-    first = told[100:].index(0.9)
+    scores = goals([((GOAL, 0.9),)] * 100 + [((DECOY, 0.9),)] * 100)
+    assert scores[:100] == [0.9] * 100
+    first = scores[100:].index(0.9)
     # the old one has 1 - 1/e of its evidence and loses it as fast as the new one gains
     assert first * PERIOD == approx(MEMORY * math.log(2.0 - math.exp(-1.0)), abs=0.04)
-    assert told[100 + first :] == [0.9] * (100 - first)
+    assert scores[100 + first :] == [0.9] * (100 - first)
 
 
 def chosen(detector, probability, rays, known):
@@ -215,12 +215,14 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
     """A thing 25 deg from where the ball is expected to 7 deg is not it, though it looks likelier;
     seen in a throw on pictures.
     """
-    here, there, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
-    assert chosen(learnt, [0.4], [here], Prior()) is None
-    ball = chosen(learnt, [0.66, 0.4], [there, here], Prior(ball_ray_c=here, ball_within=within))
-    np.testing.assert_allclose(ball.ray_c, here)
+    ball_ray, decoy, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
+    assert chosen(learnt, [0.4], [ball_ray], Prior()) is None
+    ball = chosen(
+        learnt, [0.66, 0.4], [decoy, ball_ray], Prior(ball_ray_c=ball_ray, ball_within=within)
+    )
+    np.testing.assert_allclose(ball.ray_c, ball_ray)
     assert ball.score == approx(bayes(learnt, 0.4, 0.0, within), abs=1e-6)
-    assert chosen(learnt, [0.66], [there], Prior(ball_ray_c=here, ball_within=within)) is None
+    assert chosen(learnt, [0.66], [decoy], Prior(ball_ray_c=ball_ray, ball_within=within)) is None
     assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
 
 

@@ -173,14 +173,14 @@ def test_out_of_view_tells_nothing_but_that():
     _, sides = payload_keypoints(camera, 0.2 * rays)
     partly = sides.any(-1) & ~sides.all(-1)
     assert partly.sum() > 3
-    shown, told = apply_invalid_rule(
+    shown, shown_valid = apply_invalid_rule(
         camera, torch.ones(81, 8, 2, dtype=torch.float64), torch.cat([sides, sides], -1)
     )
-    cut = told[partly, 4:]
+    cut = shown_valid[partly, 4:]
     assert not cut.all(-1).any()
     for k, (one, other) in enumerate([(1, 3), (0, 2), (1, 3), (0, 2)]):
-        assert torch.equal(told[:, 4 + k], sides[:, k] & sides[:, one] & sides[:, other])
-    assert (shown[~told] == 0.0).all()
+        assert torch.equal(shown_valid[:, 4 + k], sides[:, k] & sides[:, one] & sides[:, other])
+    assert (shown[~shown_valid] == 0.0).all()
 
 
 def test_batch_of_many_equals_batch_of_one_bit_for_bit():

@@ -75,9 +75,9 @@ def test_rectified_view_has_straight_lines():
 
 
 def test_turned_view_looks_where_it_says():
-    pixels, seen = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, yaw_deg=50.0))
+    pixels, visible = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, yaw_deg=50.0))
     # Equidistant: 50 deg to the right is 83.3 * 50 deg from the principal point, along u.
-    assert seen.all()
+    assert visible.all()
     expected = f64([159.5 + 83.3 * math.radians(50.0), 159.5])
     assert torch.allclose(pixels[20, 20], expected, atol=1e-9)
     up, _ = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, pitch_deg=50.0))

@@ -35,4 +35,4 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
 
 
 def test_a_missing_policy_is_reported(tmp_path, refused):
-    refused(f"cooperative fly trio --out {tmp_path}", said="no policy 'trio'")
+    refused(f"cooperative fly trio --out {tmp_path}", message="no policy 'trio'")

@@ -118,12 +118,12 @@ def test_the_gap_is_the_least_over_all_pairs(vehicles):
     assert_close(env.gap().tolist(), [gap for gap, _ in expected], atol=1e-5, rtol=0)
 
 
-def test_three_vehicles_release_when_all_asked_and_land_after_the_last():
+def test_three_vehicles_release_on_the_last_request_and_land_after_the_last():
     env = TeamEnv(as_flown(experiment("pair", "team.vehicles=3"), "late"), seed=3, count=12)
     assert env.get_observations()["actor"].shape == (12, env.layout.dimension)
-    asked = torch.ones(4, 3)
-    asked[0, 2] = asked[1, 1] = asked[2, 0] = -1.0
-    env.step(hover(env, asked.flatten()))
+    requests = torch.ones(4, 3)
+    requests[0, 2] = requests[1, 1] = requests[2, 0] = -1.0
+    env.step(hover(env, requests.flatten()))
     env.step(hover(env, -torch.ones(12)))
     tripped = env._worlds(env.views.state["release_timer"] >= 0.0)
     assert tripped.tolist() == [[False] * 3] * 3 + [[True] * 3]
@@ -155,8 +155,8 @@ def test_an_actor_sees_how_long_ago_its_latch_tripped():
     env = TeamEnv(as_flown(experiment(), "none"), seed=3, count=4)
     counts = []
     for k in range(6):
-        asked = torch.tensor([1.0, 1.0, 1.0, -1.0]) if k != 4 else -torch.ones(4)
-        observed = env.step(hover(env, asked))[0]["actor"]
+        requests = torch.tensor([1.0, 1.0, 1.0, -1.0]) if k != 4 else -torch.ones(4)
+        observed = env.step(hover(env, requests))[0]["actor"]
         counts.append(observed[:, -1].tolist())
     assert counts == [[0.0] * 4] + [[k, k, 0.0, 0.0] for k in (1.0, 2.0, 3.0, 4.0, 5.0)]
 
@@ -174,7 +174,7 @@ def test_the_load_clears_the_vehicle_that_it_flies_past():
 
 
 @mark.parametrize(
-    ("coefficient", "conditions", "asked"),
+    ("coefficient", "conditions", "latch"),
     [
         ("team.contact_cost", ["team.rotor_reach=0.33"], -1.0),
         ("team.margin_cost", ["team.rotor_reach=0.26"], -1.0),
@@ -184,13 +184,13 @@ def test_the_load_clears_the_vehicle_that_it_flies_past():
         ("task.reward.proximity", ["release.clearance_margin=5.0"], 1.0),
     ],
 )
-def test_a_step_is_paid_as_worked_by_hand(coefficient, conditions, asked):
+def test_a_step_is_paid_as_worked_by_hand(coefficient, conditions, latch):
     rewards = []
     for value in (0.0, 10.0):
         torch.manual_seed(3)
         changes = experiment("pair", f"{coefficient}={value}", *conditions)
         env = TeamEnv(as_flown(changes, "none"), seed=3, count=4)
-        actions = hover(env, torch.full((4,), asked))
+        actions = hover(env, torch.full((4,), latch))
         actions[:, 1:4] = torch.tensor([0.1, -0.2, 0.3])
         for _ in range(9):
             _, reward, done, _ = env.step(actions)

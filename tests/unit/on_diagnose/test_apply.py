@@ -100,8 +100,8 @@ def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_
     out = tmp_path / "mine.toml"
     theta = {"battery_charge": 0.04, "thrust_gain": 0.03}
     found = diagnosis(theta=theta, covariance=[[1e-4, 9e-5], [9e-5, 4e-4]])
-    said = printed(f"diagnose apply {found} --out {out}")
-    assert "Not written: battery_charge" in said
+    output = printed(f"diagnose apply {found} --out {out}")
+    assert "Not written: battery_charge" in output
     assert "Not written: battery_charge" in out.read_text()
     after = load_experiment(out)
     assert after.vehicle.battery == shipped().vehicle.battery
@@ -109,9 +109,9 @@ def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_
     assert after.diagnosed.covariance == ((4e-4,),)
     assert_allclose(after.vehicle.thrust.gain, 1.03)
     alone = diagnosis(theta={"battery_charge": 0.04}, covariance=[[1e-4]])
-    said = printed(f"diagnose apply {alone} --out {tmp_path}/none.toml")
-    assert "Not written: battery_charge" in said
-    assert "the configuration stands as it is" in said
+    output = printed(f"diagnose apply {alone} --out {tmp_path}/none.toml")
+    assert "Not written: battery_charge" in output
+    assert "the configuration stands as it is" in output
     assert not (tmp_path / "none.toml").exists()
 
 
@@ -131,7 +131,7 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refu
         (None, "", "names no plant"),
     ):
         report = diagnosis(plant=plant, **found)
-        refused(f"diagnose apply {report} {option} --out {out}", said=message)
+        refused(f"diagnose apply {report} {option} --out {out}", message=message)
     assert not out.exists()
     assert run_command(f"diagnose apply {diagnosis(plant=str(quick), **found)} --out {out}") == 0
     after = load_experiment(out)
@@ -155,19 +155,21 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
     assert load_experiment(out).laws == (
         LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
     )
-    refused(f"{command} --laws 2", said="asks for number 2 of its laws; expected a number up to 1")
+    refused(
+        f"{command} --laws 2", message="asks for number 2 of its laws; expected a number up to 1"
+    )
     assert "--laws 1 writes it" in printed(command)
     path = diagnosis(theta={}, covariance=[], laws=[law | {"factors": ["sped"]}])
     command = f"diagnose apply {path} --out {tmp_path / 'other.toml'} --laws 1"
-    refused(command, said="no factor 'sped'; did you mean 'speed'?")
+    refused(command, message="no factor 'sped'; did you mean 'speed'?")
 
 
 def test_a_formula_without_a_coefficient_is_no_law_to_write(diagnosis, tmp_path, refused):
     reason = "F = f(|v|) v, with any function f, explains 40 nats"
     path = diagnosis(theta={}, covariance=[], overall="UNKNOWN", reasons=[reason])
     command = f"diagnose apply {path} --out {tmp_path / 'law.toml'} --laws 1"
-    refused(command, said="it holds none")
-    refused(command, said=reason)
+    refused(command, message="it holds none")
+    refused(command, message=reason)
 
 
 def test_every_effect_can_be_written():
@@ -232,7 +234,7 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
 )
 def test_mistakes_are_reported(diagnosis, changes, message, tmp_path, refused):
     out = tmp_path / "x.toml"
-    refused(f"diagnose apply {diagnosis(**changes)} --out {out}", said=message)
+    refused(f"diagnose apply {diagnosis(**changes)} --out {out}", message=message)
     assert not out.exists()
 
 
@@ -277,7 +279,7 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
     out = tmp_path / "x.toml"
     refused(
         f"diagnose apply {diagnosis(**BALL)} --config motor_stand --out {out}",
-        said="of the model 'ball'; the model of diagnose/motor_stand.toml is stand",
+        message="of the model 'ball'; the model of diagnose/motor_stand.toml is stand",
     )
     out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
     for theta, unit, name, message in (
@@ -299,7 +301,9 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
         report = diagnosis(
             **{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]}
         )
-        refused(f"diagnose apply {report} --config {name} --out {tmp_path}/none.toml", said=message)
+        refused(
+            f"diagnose apply {report} --config {name} --out {tmp_path}/none.toml", message=message
+        )
         assert not (tmp_path / "none.toml").exists()
     at_bound = diagnosis(**{**BALL, "theta": {"ball_drag": 0.1 + 1e-12}})
     assert run_command(f"diagnose apply {at_bound} --config {out} --out {tmp_path}/bound.toml") == 0
@@ -342,7 +346,7 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):
         + b"I\x00\x05"
     )
     command = f"diagnose apply {log} --plant vision --out {out}"
-    refused(command, said="--hover")
+    refused(command, message="--hover")
     assert run_command(f"{command} --hover 0.3645 --delay 0.003") == 0
     after = load_experiment(out)
     assert after.vehicle.controller.kind == "motor_mixing"

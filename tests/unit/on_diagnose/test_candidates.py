@@ -63,10 +63,10 @@ class Levered(SyntheticModel):
         return self.lever * w.effects[:, 3] * EFFECTS[3].floor / EFFECTS[self.by].floor
 
     def windows(self, theta):
-        own = np.arange(len(EFFECTS)) == self.by
+        mask = np.arange(len(EFFECTS)) == self.by
         found = zip(super().windows(theta), self.residuals(theta))
         return [
-            replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own)
+            replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * mask)
             for w, r in found
         ]
 
@@ -82,10 +82,10 @@ def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
         truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
         diagnosis = explain_without_laws(Levered(truth=truth, seed=seed, throws=8))
         assert diagnosis.named == (NAME,)
-        size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
-        off.append((own.estimate - size) / own.sd)
-        assert diagnosis.theta[NAME] == own.estimate
-        assert diagnosis.covariance[0][0] >= own.sd**2
+        size, finding = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
+        off.append((finding.estimate - size) / finding.sd)
+        assert diagnosis.theta[NAME] == finding.estimate
+        assert diagnosis.covariance[0][0] >= finding.sd**2
     assert abs(np.mean(off)) < 1.0, off
 
 
@@ -153,11 +153,13 @@ def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected)
 
 
 def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():
-    said = []
+    messages = []
     model = Spoiled(truth={"effect_00": 15.0}, throws=8, seed=4)
     model.rough, model.beyond = 4.0, 5.0
-    diagnosis = diagnose_flights.explain(model, laws=False, progress=said.append)
-    assert sum("are left out, which the simulation does not follow" in line for line in said) == 1
+    diagnosis = diagnose_flights.explain(model, laws=False, progress=messages.append)
+    assert (
+        sum("are left out, which the simulation does not follow" in line for line in messages) == 1
+    )
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)
     count = len(model.windows({}))

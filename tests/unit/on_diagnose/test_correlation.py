@@ -43,9 +43,9 @@ def flown(seed: int, colour: str, **options) -> SyntheticModel:
     )
     rng = default_rng([seed, 1])
     for i, window in enumerate(model._windows):
-        own = [noise(rng, len(window.residual) // 6, colour).ravel() for _ in range(2)]
+        noises = [noise(rng, len(window.residual) // 6, colour).ravel() for _ in range(2)]
         model._windows[i] = replace(
-            window, residual=window.residual + window.sigma * np.concatenate(own)
+            window, residual=window.residual + window.sigma * np.concatenate(noises)
         )
     return model
 
@@ -59,13 +59,13 @@ def estimated(model: SyntheticModel) -> dict[int, Correlation]:
 def test_inner_products_are_those_of_the_dense_covariance(order):
     window = flown(1, "white").windows({})[0]
     known = Correlation(0.02, 0.9, order, 1.7)
-    (told,) = with_correlations([window], {1: known})
+    (correlated,) = with_correlations([window], {1: known})
     dense = np.diag(window.sigma**2)
     for part in components(window, 1).T:
         lag = window.time[part][:, None] - window.time[part]
         dense[np.ix_(part, part)] = (1.7 * window.sigma[part[0]]) ** 2 * known.at_lag(lag)
     floors = np.ones(SOME)
-    z, gram = marginal.columns(window, floors), marginal.gram_of(told, floors, 2)
+    z, gram = marginal.columns(window, floors), marginal.gram_of(correlated, floors, 2)
     inverse = np.linalg.inv(dense)
     assert_allclose(
         gram.inner.sum(0), z.T @ inverse @ z, rtol=1e-6, atol=1e-9 * np.abs(gram.inner).max()
@@ -73,7 +73,7 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
     assert gram.square.sum() == approx(window.residual @ inverse @ window.residual)
     assert 2.0 * gram.log_sigma == approx(np.linalg.slogdet(dense)[1])
     other = default_rng(0).normal(size=len(window.residual)) * window.sigma
-    again = marginal.with_residual(gram, told, other, floors)
+    again = marginal.with_residual(gram, correlated, other, floors)
     assert_allclose(
         again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max()
     )
@@ -91,11 +91,11 @@ def test_white_noise_is_white():
 def test_time_order_and_size_are_those_planted(colour, order):
     found = estimated(flown(3, colour))
     assert set(found) == {0, 1}
-    for own in found.values():
-        assert own.order == order
-        assert TIME / 2.0 < own.time < 2.0 * TIME
-        assert own.share > 0.9
-        assert 0.7 < own.scale < 1.4
+    for fitted in found.values():
+        assert fitted.order == order
+        assert TIME / 2.0 < fitted.time < 2.0 * TIME
+        assert fitted.share > 0.9
+        assert 0.7 < fitted.scale < 1.4
 
 
 def test_noise_that_is_correlated_is_no_cause(monkeypatch):

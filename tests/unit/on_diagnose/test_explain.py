@@ -74,15 +74,15 @@ def test_what_was_explained_is_what_training_draws(once, tmp_path):
 
 
 def test_one_bad_log_of_three_does_not_refuse_the_others(flights, tmp_path):
-    status, said = explained([in_millimetres(flights[0]), *flights[1:]], tmp_path)
-    assert (status, said["flights"]) == (0, 2)
-    assert any(reason.startswith("left out: 0.npz") for reason in said["reasons"])
+    status, answer = explained([in_millimetres(flights[0]), *flights[1:]], tmp_path)
+    assert (status, answer["flights"]) == (0, 2)
+    assert any(reason.startswith("left out: 0.npz") for reason in answer["reasons"])
 
 
 def test_where_most_logs_are_bad_the_status_says_so(flights, tmp_path):
-    status, said = explained([*map(in_millimetres, flights[:2]), flights[2]], tmp_path)
-    assert (status, said["overall"]) == (REFUSED, "DATA INCONSISTENT")
-    assert np.size(said["findings"]) == 0
+    status, answer = explained([*map(in_millimetres, flights[:2]), flights[2]], tmp_path)
+    assert (status, answer["overall"]) == (REFUSED, "DATA INCONSISTENT")
+    assert np.size(answer["findings"]) == 0
 
 
 def test_no_earlier_answer_is_left_where_an_explanation_stops(flights, tmp_path):

@@ -82,19 +82,19 @@ def judged(monkeypatch, truth, same=(), **changes):
 
 
 @mark.parametrize(
-    ("share", "low", "high", "verdict", "said"),
+    ("share", "low", "high", "verdict", "reason"),
     [
         (0.4, -0.2, 1.0, result.CANDIDATE, "confirm effect_05 (they bear out 40 % [-20, 100]"),
         (-0.1, -0.3, 0.1, result.NOT_IDENTIFIABLE, "are explained worse with effect_05"),
     ],
 )
 def test_names_that_held_out_flights_do_not_confirm_are_none(
-    monkeypatch, share, low, high, verdict, said
+    monkeypatch, share, low, high, verdict, reason
 ):
     diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=share, low=low, high=high)
     assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
     assert diagnosis["effect_05"].verdict == verdict
-    assert said in diagnosis.reasons[0]
+    assert reason in diagnosis.reasons[0]
 
 
 def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(monkeypatch):
@@ -207,8 +207,8 @@ def test_two_causes_that_may_be_two_others_are_reported():
         (("mass", "curve"), 1.66),
         (("sag",), 2.9),
     ]  # the second is a class
-    told = instead(SimpleNamespace(theta={"lag": 1.0, "drag": 2.0}, sets=sets))
-    assert told == [
+    lines = instead(SimpleNamespace(theta={"lag": 1.0, "drag": 2.0}, sets=sets))
+    assert lines == [
         "curve, mass in place of drag, lag, 1.7 nats behind",
         "sag in place of drag, lag, 2.9 nats behind",
     ]

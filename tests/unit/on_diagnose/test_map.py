@@ -218,7 +218,7 @@ def test_rows_that_share_a_stamp_have_a_clock():
     assert propose(table, "a.csv").why["time"].endswith("100 Hz")
 
 
-def test_what_is_not_known_is_asked(tmp_path):
+def test_an_unknown_number_becomes_a_question(tmp_path):
     columns = flight(20.0)
     found = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")
     assert asks(found, "how far are the rows apart")
@@ -247,15 +247,15 @@ def unnamed(
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_metres_with_radians_are_distinguished_from_centimetres_with_degrees_or_asked_about(seed):
+def test_metres_with_radians_differ_from_centimetres_with_degrees_or_become_a_question(seed):
     """About the origin both stay in a hall, and a hundredth of the path is near a 57th
     of the lean.
     """
     for units in (("cm", "deg"), ("m", "rad")):
         found = propose(unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv")
         made = units_of(found)
-        asked = "".join(found.questions)
-        assert made == {"pos_w": units[0], "quat_wb": units[1]} or "with deg would do" in asked
+        questions = "".join(found.questions)
+        assert made == {"pos_w": units[0], "quat_wb": units[1]} or "with deg would do" in questions
 
 
 def test_angles_that_would_turn_a_flight_over_are_in_degrees():
@@ -272,7 +272,7 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
     assert [(c.name, c.unit) for c in found.mapping.channels] == [("pos_w", "mm")]
     assert "falls freely" in found.why["pos_w"]
     slow = {"time": 0.01 * np.arange(2000)}
-    for reach, unit, asked in (
+    for reach, unit, is_question in (
         (3.0, "m", False),
         (15.0, "m", True),
         (400.0, "mm", True),
@@ -283,7 +283,7 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
             slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv"
         )
         assert found.mapping.channels[0].unit == unit
-        assert asks(found, f"'{unit}' is a guess") == asked
+        assert asks(found, f"'{unit}' is a guess") == is_question
 
 
 def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
@@ -325,7 +325,7 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     assert asks(strange, "no unit explains that")
 
 
-def test_a_mass_that_nothing_can_doubt_is_asked_about():
+def test_a_mass_that_no_data_contradicts_becomes_a_question():
     file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
     found = propose(table_of(file), file.name, mass=27.0)
     assert asks(found, "the vehicle weighs 27 kg? Nothing in the log is in newtons")
@@ -345,14 +345,14 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
         {name: whole[name] for name in ("rate_b", "acc_b", "command")}, {"source": "a.npz"}
     )
     late = {name: columns[name][300:] for name in ("pos_w", "quat_wb")}
-    seen = log_at(whole["pos_w"].time[300:] + 37.42, **late)
-    seen.meta["source"] = "b.npz"
-    offset, correlation, by = offset_of(onboard, seen)
+    captured = log_at(whole["pos_w"].time[300:] + 37.42, **late)
+    captured.meta["source"] = "b.npz"
+    offset, correlation, by = offset_of(onboard, captured)
     assert offset == approx(-37.42, abs=0.01)
     assert correlation > 0.9
     assert by == "body rates"
     onboard.save(tmp_path / "a.npz")
-    seen.save(tmp_path / "b.npz")
+    captured.save(tmp_path / "b.npz")
     (log,) = read(f"{tmp_path}/a.npz+{tmp_path}/b.npz")
     assert log["pos_w"].time == approx(whole["pos_w"].time[300:], abs=0.01)
     assert set(log.channels) == {"rate_b", "acc_b", "command", "pos_w", "quat_wb"}
@@ -480,7 +480,7 @@ def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     assert found.flyer["motor_time_constant"] == tau
 
 
-def test_outputs_without_a_motor_are_left_out_and_what_drives_a_flap_is_asked_about():
+def test_outputs_without_a_motor_are_left_out_and_a_flaps_output_becomes_a_question():
     columns = flight(20.0)
     outputs = np.tile(1000.0 + 400.0 * columns["command"][:, :1] / 2.0, (1, 6))
     outputs[:, 4:] = 900.0

@@ -104,8 +104,8 @@ class TestBall:
         nothing of it.
         """
         truth, stamps, paths = beside_aeroid.world(240000100)
-        seen = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
-        diagnosis = explain_without_laws(beside_aeroid.model_of(stamps, seen))
+        positions = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
+        diagnosis = explain_without_laws(beside_aeroid.model_of(stamps, positions))
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
         assert all(
@@ -154,8 +154,8 @@ class TestStand:
         base = fitting.config.load(fitting.VehicleParams, fitting.config.find("vehicle", "paper"))
         vehicle = fitting.vehicle_of(setups.Setup("", stand=STAND), result, base)
         speed = np.array([600.0, 1200.0, 1700.0])
-        told = vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed
-        assert told == approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
+        thrust = vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed
+        assert thrust == approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
 
     def test_command_line_writes_a_vehicle(self, tmp_path, capsys):
         for i in range(3):
@@ -199,12 +199,12 @@ class TestFlyer:
         params = replace(DRIVEN_BY_THRUST, mass=mass, motor_time_constant=tau)
         time = np.arange(0.0, 4.0, 0.01)
         sent = np.arange(-phase, 4.0, 0.01)
-        told = mass * G * (1.0 + 0.3 * rng.normal(size=len(sent)))
+        thrust = mass * G * (1.0 + 0.3 * rng.normal(size=len(sent)))
         since = np.maximum(time[:, None] - sent[1:], 0.0)
         rises = 0.5 * since**2 - tau * since + tau**2 * (1.0 - np.exp(-since / tau))
-        height = 5.0 + 0.5 * (told[0] / mass - G) * time**2 + rises @ np.diff(told) / mass
+        height = 5.0 + 0.5 * (thrust[0] / mass - G) * time**2 + rises @ np.diff(thrust) / mass
         log = level_log(time, np.outer(height, [0.0, 0.0, 1.0]))
-        log = with_channels(log, thrust_command=Channel(sent, told[:, None], "N"))
+        log = with_channels(log, thrust_command=Channel(sent, thrust[:, None], "N"))
         off = np.concatenate(FlyerModel([log], params).residuals({}))
         assert np.abs(off).max() < 1e-4  # motion capture has more noise
 
@@ -357,13 +357,13 @@ class TestFlyer:
     def test_effects_push_a_hovering_vehicle_as_their_equations_say(self, name, size, expected):
         """Closed form: half the acceleration that an effect makes times the time squared."""
         model = FlyerModel([self.carried([0.0, 0.0, 2.0])], DRIVEN_BY_THRUST)
-        seen = []
+        measured = []
         for theta in ({}, {name: size}):
             lanes = model._lanes(model.size(theta))
             (first, *_) = model.simulate(lanes)
-            seen.append(model.measure(model.stretches[0], first[None], lanes).reshape(-1, 3))
+            measured.append(model.measure(model.stretches[0], first[None], lanes).reshape(-1, 3))
         since = model.stretches[0].time[::3] - model.stretches[0].data["start"]
-        assert seen[1] - seen[0] == approx(
+        assert measured[1] - measured[0] == approx(
             0.5 * np.outer(since**2, expected), abs=3e-4
         )  # the angle squared
 
@@ -444,8 +444,8 @@ class TestImu:
         rows = []
         for i, t in enumerate(time):
             if i % 10 == 0:  # commands at 200 Hz
-                wanted = [3.0, 3.0, 1.0] * np.sin(tones[0] * t + tones[1][:3])
-                torque = np.array(p.torque.inertia) * [30.0, 30.0, 10.0] * (wanted - rate)
+                rate_command = [3.0, 3.0, 1.0] * np.sin(tones[0] * t + tones[1][:3])
+                torque = np.array(p.torque.inertia) * [30.0, 30.0, 10.0] * (rate_command - rate)
                 level = hover * (1.0 + 0.3 * np.sin(9.0 * t + tones[1][3]))
                 sent = np.clip(level + unmixed @ torque, 0.2 * hover, 3.0 * hover)
                 acc = (thrust * (1.0 + curve * (thrust / hover - 1.0))).sum() / p.mass
@@ -530,7 +530,7 @@ class TestSetups:
         for command in ("explain", "fit"):
             refused(
                 f"diagnose {command} {swing} --config pendulum_encoder",
-                said="its model is a program of the repository: examples/pendulum",
+                message="its model is a program of the repository: examples/pendulum",
             )
 
     def test_a_simulated_vehicle_gets_what_a_flight_showed(self):

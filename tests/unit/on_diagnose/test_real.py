@@ -44,10 +44,10 @@ def explained(setup: str, *paths: str | Path):
     named = {f.name for f in diagnosis.findings if f.verdict in NAMED}
 
     def rms(theta, channel=0):
-        own = [s.channel == channel for s in model.stretches]
+        masks = [s.channel == channel for s in model.stretches]
         return float(
             np.sqrt(
-                np.mean(np.concatenate([r[o] for r, o in zip(model.residuals(theta), own)]) ** 2)
+                np.mean(np.concatenate([r[o] for r, o in zip(model.residuals(theta), masks)]) ** 2)
             )
         )
 

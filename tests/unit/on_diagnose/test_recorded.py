@@ -18,14 +18,14 @@ def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> 
     """Ten seconds whose body rates swing at 10 Hz, seen at so many samples a second, none in the
     gap.
     """
-    at, seen = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
-    seen = seen[(seen <= gap[0]) | (seen >= gap[1])]
-    values = np.sin(2.0 * np.pi * 10.0 * seen)[:, None] * SWING
+    at, stamps = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
+    stamps = stamps[(stamps <= gap[0]) | (stamps >= gap[1])]
+    values = np.sin(2.0 * np.pi * 10.0 * stamps)[:, None] * SWING
     values += noise * default_rng(0).standard_normal(values.shape)
     still = np.zeros((len(at), 3)) + 1e-4 * default_rng(1).standard_normal((len(at), 3))
     quat = np.column_stack((1e-4 * default_rng(2).standard_normal((len(at), 3)), np.ones(len(at))))
     commands = log_at(at[::4], command=np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)))
-    gyro = log_at(seen, rate_b=values)
+    gyro = log_at(stamps, rate_b=values)
     return with_channels(
         log_at(at, pos_w=still, quat_wb=quat), **commands.channels, **gyro.channels
     )

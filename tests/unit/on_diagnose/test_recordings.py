@@ -181,7 +181,7 @@ def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
 
 
 @mark.parametrize("name", WRITERS)
-def test_damage_is_said(name, tmp_path):
+def test_damage_is_reported(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
     path.write_bytes(path.read_bytes()[:300])

@@ -136,10 +136,10 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     alike = SyntheticModel(same=SAME, throws=1, free=0, seed=9)
     aim = plan.PlanningGoal(degenerate)
     models = {"hover": alike, "circle": apart}
-    told = [
+    informations = [
         (m, aim.information(models[m.name])) for m in manoeuvres.catalogue() if m.name in models
     ]
-    ranked = plan.propose(aim, told)
+    ranked = plan.propose(aim, informations)
     assert [p.name for p in ranked] == ["circle", "hover"]
     assert ranked[0].nats > plan.DECISIVE > ranked[1].nats
     assert ranked[0].repeats == 1
@@ -148,14 +148,14 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
 
 
 def test_a_session_holds_what_separates_more_than_what_stands_before_it():
-    said = (
+    flights = (
         ("circle", (("a", "b"), ("a", "c"))),
         ("swing", (("a", "c"),)),
         ("hover", ()),
         ("weigh", (("a", "d"),)),
     )
     proposals = [
-        plan.FlightProposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in said
+        plan.FlightProposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in flights
     ]
     assert [p.name for p in plan.session(proposals)] == ["circle", "weigh"]
 
@@ -341,7 +341,7 @@ def test_the_recording_is_written(tmp_path, found):
 
 
 @mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("explain nothing.npz", "nothing.npz"),
         ("blind nothing.npz", "nothing.npz"),
@@ -362,11 +362,13 @@ def test_the_recording_is_written(tmp_path, found):
         ("check nothing.npz --json .", "it is a folder; expected a file"),
     ],
 )
-def test_mistakes_on_the_command_line_are_reported(capsys, tmp_path, monkeypatch, arguments, said):
+def test_mistakes_on_the_command_line_are_reported(
+    capsys, tmp_path, monkeypatch, arguments, message
+):
     monkeypatch.chdir(tmp_path)
     assert run_command(f"diagnose {arguments}") == 2
     printed = capsys.readouterr()
-    assert said in printed.err
+    assert message in printed.err
     assert printed.out == "", "before the search"
 
 
@@ -376,11 +378,13 @@ def test_an_event_is_left_out_or_weighs_little(found):
     """
     _, diagnosis = found
     flights = {w.flight for w in diagnosis.work.after.windows}
-    told = replace(diagnosis, events=(min(flights), max(flights) + 1))
-    little, out = (line for line in report.summary(told).splitlines() if line.startswith("EVENT"))
+    with_events = replace(diagnosis, events=(min(flights), max(flights) + 1))
+    little, out = (
+        line for line in report.summary(with_events).splitlines() if line.startswith("EVENT")
+    )
     assert f"flight {min(flights)} " in little
     assert little.endswith("weighs little")
     assert f"flight {max(flights) + 1} " in out
     assert out.endswith("left out")
-    parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
+    parts = [part.text for part in report.sections(with_events)[0].parts if hasattr(part, "text")]
     assert sum(text.startswith("**EVENT.**") for text in parts) == 2

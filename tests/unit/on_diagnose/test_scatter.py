@@ -71,8 +71,8 @@ def flights(rng, count=10, **deviation):
     K, F = len(NAMES), np.arange(count)
     mix = rng.normal(size=(count, K, K)) * 0.3 + np.eye(K)
     information = 4.0 * np.einsum("fij,fkj->fik", mix, mix)
-    own = np.array([deviation.get(name, 0.0) for name in NAMES]) / PRIORS.floor
-    theta = rng.normal(size=(count, K)) * own + rng.uniform(-0.5, 0.5, K)
+    spread = np.array([deviation.get(name, 0.0) for name in NAMES]) / PRIORS.floor
+    theta = rng.normal(size=(count, K)) * spread + rng.uniform(-0.5, 0.5, K)
     noise = np.einsum("fij,fj->fi", np.linalg.cholesky(information), rng.normal(size=(count, K)))
     score = np.einsum("fij,fj->fi", information, theta) + noise
     return Statistics(F, information, score, np.zeros(count), np.full(count, 500), np.zeros(K))
@@ -83,9 +83,9 @@ def campaign(rng, days, by_day, by_flight):
     with these deviations.
     """
     found, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
-    own = np.repeat(rng.normal(size=days) * by_day / floor, 3)
+    offsets = np.repeat(rng.normal(size=days) * by_day / floor, 3)
     return (
-        replace(found, score=found.score + found.information[:, :, 0] * own[:, None]),
+        replace(found, score=found.score + found.information[:, :, 0] * offsets[:, None]),
         np.repeat(np.arange(days), 3).tolist(),
     )
 
@@ -207,7 +207,7 @@ def delay_jitter(diagnosis):
 
 def test_what_single_flights_differ_by_is_integrated_out():
     found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
-    left, own, score = (
+    left, information, score = (
         freed(found, share(j, FLIGHT, size)),
         found.information[0],
         found.score[0],
@@ -215,8 +215,8 @@ def test_what_single_flights_differ_by_is_integrated_out():
     theta = default_rng(4).normal(size=K)
 
     def misfit(x):
-        there = theta + np.eye(K)[j] * x[:, None]
-        return -2.0 * there @ score + np.einsum("xi,ij,xj->x", there, own, there)
+        shifted = theta + np.eye(K)[j] * x[:, None]
+        return -2.0 * shifted @ score + np.einsum("xi,ij,xj->x", shifted, information, shifted)
 
     x = np.linspace(-12.0 * size, 12.0 * size, 20001)
     density = (
@@ -225,8 +225,8 @@ def test_what_single_flights_differ_by_is_integrated_out():
         / size
     )
     whole = found.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
-    told = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
-    assert_allclose(told, whole, rtol=1e-9)
+    integrated = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
+    assert_allclose(integrated, whole, rtol=1e-9)
 
 
 # Less than what flights may differ by, and more.
@@ -274,29 +274,29 @@ def world(seed: int):
     """Statistics of flights about no lag, and the same flights simulated with another."""
     rng, K, count = np.random.default_rng(seed), len(NAMES), 12
     lags = rng.normal(size=count) * TRUTH / PRIORS.floor[0]
-    seen = answer(lags) + rng.normal(size=count) / np.sqrt(INFORMATION)
+    measured = answer(lags) + rng.normal(size=count) / np.sqrt(INFORMATION)
     information = np.tile(np.eye(K), (count, 1, 1))
     information[:, 0, 0] = INFORMATION
     score = np.zeros((count, K))
-    score[:, 0] = INFORMATION * seen
+    score[:, 0] = INFORMATION * measured
     found = Statistics(
         np.arange(count),
         information,
         score,
-        INFORMATION * seen**2,
+        INFORMATION * measured**2,
         np.full(count, 500),
         np.zeros(K),
     )
 
     def again(theta):
-        left = seen - answer(theta[0])
-        there = replace(
+        left = measured - answer(theta[0])
+        simulated = replace(
             found,
             square=INFORMATION * left**2,
             score=INFORMATION * left[:, None] * np.eye(1, K),
             theta=theta,
         )
-        return there if abs(theta[0]) < 40.0 else None
+        return simulated if abs(theta[0]) < 40.0 else None
 
     return found, again
 
@@ -318,7 +318,7 @@ def test_flights_far_apart_are_judged_by_simulations_where_they_lie():
     without = [jitter(world(seed)[0], None) for seed in range(40)]
     assert all(s.found for s in with_it)
     inside, outside = (
-        np.mean([s.low <= TRUTH <= s.high for s in told]) for told in (with_it, without)
+        np.mean([s.low <= TRUTH <= s.high for s in sizes]) for sizes in (with_it, without)
     )
     assert inside > 0.85, inside  # 95 %, less three deviations of 40 draws
     assert outside < 0.7, (

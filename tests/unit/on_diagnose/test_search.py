@@ -66,12 +66,12 @@ def test_three_effects_are_named_also_where_bends_would_fake_one(curvature):
         assert abs(size - TRIPLE[name]) < 1.5
 
 
-def hiding(own: float, **options) -> SyntheticModel:
+def hiding(share: float, **options) -> SyntheticModel:
     """Flights in which effect 7 undoes effect 3, of the same size, but for its ``own`` share."""
 
     def change(model, window):
         columns = window.effects.copy()
-        columns[:, 7] = own * columns[:, 7] - columns[:, 3]
+        columns[:, 7] = share * columns[:, 7] - columns[:, 3]
         return pushed(model, replace(window, effects=columns), effect_03=14.0, effect_07=14.0)
 
     return altered(change, seed=3, **options)
@@ -194,10 +194,10 @@ def test_flights_that_differ_each_for_itself_leave_nothing_to_vary():
 def best_set(sizes) -> set[str]:
     """Return the names of the set that flights ask for, each with its own size of one effect."""
     priors = replace(_priors(1), slab=np.full(1, 20.0))
-    own = np.full((len(sizes), 1, 1), 4.0)  # information: half a floor's deviation each
+    information = np.full((len(sizes), 1, 1), 4.0)  # information: half a floor's deviation each
     none = np.zeros(len(sizes))
     statistics = Statistics(
-        np.arange(len(sizes)), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
+        np.arange(len(sizes)), information, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
     )
     effects = [replace(EFFECTS[3], prior_sd=20.0, floor=1.0)]
     best, _ = chosen_of(statistics, effects=effects, priors=priors, least=5.0)

@@ -165,10 +165,10 @@ def test_initial_states_follow_the_effects(planted):
     transient hides what it does.
     """
     model = model_of(planted[0], "com_y")
-    nominal, there = linearised(model), np.array([15.0])
+    nominal, size = linearised(model), np.array([15.0])
     blind = {i: replace(w, effects=0.0 * w.effects) for i, w in nominal.about.windows.items()}
     fixed = replace(nominal, about=replace(nominal.about, windows=blind))  # its states stay behind
-    follow, behind = (moved(point, there) for point in (nominal, fixed))
+    follow, behind = (moved(point, size) for point in (nominal, fixed))
     assert curvature(nominal, follow) < 0.2 * curvature(nominal, behind)
     back = moved(follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
@@ -287,7 +287,9 @@ def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
     blind = model_of(projected, "plane_height", "camera_latency", camera=camera)
     assert "keypoints" not in blind.channels
     visible = Priors.of(blind.effects, tuple(blind.channels)).visible
-    assert {e.name for e, seen in zip(blind.effects, visible) if not seen} == {"camera_latency"}
+    assert {e.name for e, is_visible in zip(blind.effects, visible) if not is_visible} == {
+        "camera_latency"
+    }
 
 
 def test_a_manoeuvre_is_planned_beside_a_camera(planted):
@@ -325,9 +327,9 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
         plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight
     )
     calibrated = replace(plant, vehicle=replace(plant.vehicle, controller=mixing))
-    told = hover_state(flight, calibrated)
-    assert told["voltage"][0] == approx(16.5, abs=0.02)
-    assert hover_state(climbing, calibrated)["charge_used"][0] == told["charge_used"][0]
+    state = hover_state(flight, calibrated)
+    assert state["voltage"][0] == approx(16.5, abs=0.02)
+    assert hover_state(climbing, calibrated)["charge_used"][0] == state["charge_used"][0]
     assert hover_state(flight, plant)["charge_used"][0] == 0.2
 
 

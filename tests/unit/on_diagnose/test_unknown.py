@@ -275,11 +275,13 @@ def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch)
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
-def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> Selector:
+def beside_a_law(model: SyntheticModel, active: list[int], *active_terms: laws.Term) -> Selector:
     """A selection that has come to some names and laws."""
     point = linearised(model)
-    if told:
-        (point,) = terms.extended([point], [terms.as_effect(term, 0.1, 7.0) for term in told])
+    if active_terms:
+        (point,) = terms.extended(
+            [point], [terms.as_effect(term, 0.1, 7.0) for term in active_terms]
+        )
     columns = [*active, *range(len(model.effects), len(point.theta))]
     found = Selector(point, 4.0)
     chosen = frozenset(c for c in found.candidates if c.group == ALL and c.columns[0] in columns)
@@ -362,10 +364,10 @@ def test_the_table_takes_up_what_no_name_explains():
     weights = trained.weights(trained.statistics.flights != 5)
     index = next(i for i, w in enumerate(point.windows) if w.flight == 5 and w.phase == "throw")
     window = point.windows[index]
-    asked = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T
+    predicted = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T
     velocity = window.knots["vel_w"]
     truth = -0.02 * norm(velocity, axis=1)[:, None] * velocity
-    assert norm(asked - truth) < LEFT * norm(truth)
+    assert norm(predicted - truth) < LEFT * norm(truth)
     data = unexplained(point, 0)
     again = ForceTable(
         *(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"])

@@ -68,7 +68,7 @@ def gimbal_logs(tilt, focal, delay) -> list[FlightLog]:
     rng = default_rng(2)
     time = np.arange(0, 20, 1 / 30)
 
-    def seen(t):
+    def look(t):
         turn = Rotation.from_euler(
             "ZYX",
             np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
@@ -80,8 +80,8 @@ def gimbal_logs(tilt, focal, delay) -> list[FlightLog]:
         local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
         return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
 
-    turn, gap, _ = seen(time)
-    point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
+    turn, gap, _ = look(time)
+    point = Rotation.from_rotvec(tilt).apply(look(time - delay)[2]) * [focal, focal, 1.0]
     gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
     log = log_at(
         time,
@@ -110,7 +110,7 @@ def test_tilt_delay_and_focal_length_are_found():
 SWUNG = REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
 CUT = REAL / "crazypad_faults" / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
 TAPED = REAL / "crazypad_faults" / "tape_on_propeller_M3__E8_log00.csv.gz"
-SEEN = DATA / "slungload_camera" / "rosbag_16.csv.gz"
+CAMERA_BAG = DATA / "slungload_camera" / "rosbag_16.csv.gz"
 
 
 def named_in(diagnosis) -> set[str]:
@@ -151,9 +151,9 @@ def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
     logs = setups.read_logs([CUT], "crazypad")
     model = TrimModel(logs, E8)
     write_report(tmp_path, explain(model), model, logs, seed=0, limits=False)
-    said = capsys.readouterr().out
-    assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", said)
-    assert "nan" not in said
+    output = capsys.readouterr().out
+    assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", output)
+    assert "nan" not in output
     assert (tmp_path / "report.html").is_file()
 
 
@@ -185,10 +185,15 @@ def filmed(columns: dict) -> GimbalModel:
     [
         (swung, SWUNG, lambda t: {"theta_rad": np.nan * t["theta_rad"]}, "missing .* angle"),
         (swung, SWUNG, lambda t: {"theta_rad": np.degrees(t["theta_rad"])}, "degrees, or another"),
-        (filmed, SEEN, lambda t: {"l_px": np.nan * t["l_px"]}, "missing everywhere: payload_pos_w"),
         (
             filmed,
-            SEEN,
+            CAMERA_BAG,
+            lambda t: {"l_px": np.nan * t["l_px"]},
+            "missing everywhere: payload_pos_w",
+        ),
+        (
+            filmed,
+            CAMERA_BAG,
             lambda t: {"d_px": t["d_py"], "d_py": t["d_px"]},
             "other axes, another unit, or another marker",
         ),

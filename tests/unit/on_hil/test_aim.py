@@ -84,17 +84,17 @@ def test_a_policy_that_asks_in_hover_never_releases():
         Spy(),
     )
     decisions = fly(runner, 5.0)
-    asked = [d for d in decisions if d.note.startswith("release refused: it would land at")]
+    refusals = [d for d in decisions if d.note.startswith("release refused: it would land at")]
     assert runner.backend.release_times == []
-    assert asked[-1].time - asked[0].time == approx(0.28, abs=0.021)
-    assert all(d.observation[19] < 0.5 for d in asked), (
+    assert refusals[-1].time - refusals[0].time == approx(0.28, abs=0.021)
+    assert all(d.observation[19] < 0.5 for d in refusals), (
         "the policy is told of no release: there was none"
     )
     states = [d.state for d in decisions]
-    assert states[decisions.index(asked[-1]) + 1] == "recover"
+    assert states[decisions.index(refusals[-1]) + 1] == "recover"
     assert (
-        decisions[decisions.index(asked[-1]) + 1].reason
+        decisions[decisions.index(refusals[-1]) + 1].reason
         == "the policy released where it would miss"
     )
-    assert runner.summary()["held_back"] == len(asked)
+    assert runner.summary()["held_back"] == len(refusals)
     assert "abort" not in states

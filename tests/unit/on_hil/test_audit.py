@@ -32,11 +32,11 @@ def audit(values, write=False):
     """An audit of a vehicle with these parameters: the audit, what was asked and written, the
     tables shown.
     """
-    values, asked, written, tables = dict(values), [], [], []
+    values, requests, written, tables = dict(values), [], [], []
     box = []
 
     def ask(name):
-        asked.append(name)
+        requests.append(name)
         if name in values:
             box[0].feed(name, values[name])
 
@@ -49,15 +49,15 @@ def audit(values, write=False):
     while not box[0].done:
         box[0].service(now)
         now += 0.02
-    return box[0], asked, written, tables, now
+    return box[0], requests, written, tables, now
 
 
 def test_a_parameter_that_does_not_come_is_a_mismatch():
     values = {k: v for k, v in GOOD.items() if k != "ATC_ANGLE_BOOST"}
-    found, asked, _, tables, now = audit(values)
+    found, requests, _, tables, now = audit(values)
     assert found.problems == ["ATC_ANGLE_BOOST did not come; expected 0"]
     assert GIVE_UP < now < GIVE_UP + 0.1
-    assert 20 <= asked.count("ATC_ANGLE_BOOST") <= 27, "asked again and again"
+    assert 20 <= requests.count("ATC_ANGLE_BOOST") <= 27, "asked again and again"
     assert "no answer" in tables[0]
 
 

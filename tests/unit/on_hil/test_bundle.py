@@ -36,10 +36,10 @@ def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, print
     assert bundle.parent == folder.parent
     out = printed(f"hil replay {bundle}")
     assert "all bit for bit the same" in out
-    told = out.splitlines()[-1]
-    assert told.startswith("It went wrong ")
-    assert f"s into '{before}': {decisions[turn].reason}; the vehicle was at (" in told
-    age = float(told.split(" ms old")[0].split()[-1])
+    last_line = out.splitlines()[-1]
+    assert last_line.startswith("It went wrong ")
+    assert f"s into '{before}': {decisions[turn].reason}; the vehicle was at (" in last_line
+    age = float(last_line.split(" ms old")[0].split()[-1])
     assert age == approx(1e3 * (decisions[turn].time - LOST), abs=25.0)
 
 
@@ -80,13 +80,13 @@ def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
 def test_what_is_no_bundle(tmp_path, refused):
     (tmp_path / "no.zip").write_bytes(b"PK no")
     refused(
-        f"hil replay {tmp_path}/no.zip", said="expected a folder of a run, or the bundle of one"
+        f"hil replay {tmp_path}/no.zip", message="expected a folder of a run, or the bundle of one"
     )
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as bundle:
         bundle.writestr("holiday.txt", "x")
     refused(
         f"hil replay {tmp_path}/other.zip",
-        said="other.zip: no bundle of a run, it holds holiday.txt; expected config.toml",
+        message="other.zip: no bundle of a run, it holds holiday.txt; expected config.toml",
     )
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")
@@ -101,5 +101,5 @@ def test_a_damaged_bundle_is_refused_in_a_sentence(aborted, tmp_path, refused):
     (tmp_path / "damaged.zip").write_bytes(whole)
     refused(
         f"hil replay {tmp_path}/damaged.zip",
-        said="expected a folder of a run, or the bundle of one",
+        message="expected a folder of a run, or the bundle of one",
     )

@@ -76,8 +76,8 @@ class Hall:
         unit = rays / far[:, None] + 1e-3 * self.rng.standard_normal((5, 3))
         unit /= norm(unit, axis=1, keepdims=True)
         lens, radius = self.camera.fisheye, self.runner.params.camera.payload_radius
-        seen = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
-        unit = lens.unproject(lens.denormalize(seen))[
+        distorted = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
+        unit = lens.unproject(lens.denormalize(distorted))[
             0
         ].numpy()  # a detector knows the nominal lens
         return Detection(
@@ -168,8 +168,8 @@ def test_tilt_latency_and_thrust_are_found_in_the_runners_hover(hall):
     assert found.latency == approx(LATENCY, abs=0.004)
     assert found.thrust == approx(1.0, abs=0.02)
     assert found.scale == approx(SCALE, abs=0.004)
-    told = next(d for d in hall.decisions if d.calibration is not None)
-    assert Calibration.of(told.calibration) == found
+    decision = next(d for d in hall.decisions if d.calibration is not None)
+    assert Calibration.of(decision.calibration) == found
     assert hall.runner.summary()["calibration"] == found.values()
     assert "deg" in str(found)
     sways = [abs(d.command[1]) for d in hall.decisions if d.command is not None]
@@ -217,7 +217,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     assert calibrating.problems() == ["calibrating in the hover"]
     calibrating.take("the ball was not seen")
     assert calibrating.problems() == ["calibrating in the hover again: the ball was not seen"]
-    for broken, said in (
+    for broken, message in (
         ({"turn_sigma": (0.02, 1e-3, 1e-3)}, "known to 1.15 deg"),
         ({"latency": 0.08}, "80 ms late"),
         ({"latency_sigma": 0.01}, "known to 10.0 ms"),
@@ -225,7 +225,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
         ({"scale": -0.08}, "focal length off by 8.0 %"),
     ):
         calibrating.take(replace(fine, **broken))
-        assert said in "; ".join(calibrating.problems())
+        assert message in "; ".join(calibrating.problems())
     calibrating.take(fine)
     assert calibrating.problems() == []
     assert "yaw unknown" in str(replace(fine, turn_sigma=(1e-3, 1e-3, 0.2)))

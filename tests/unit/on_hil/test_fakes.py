@@ -61,8 +61,8 @@ def test_the_witness_catches_releases(armed, payload_w, text):
 
 def test_a_fake_reports_what_its_witness_saw():
     """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
-    here, there = pipe()
-    fake = load_fake("ardupilot")(LevelPlant(), Link(there, 1, 1))
+    here, far_end = pipe()
+    fake = load_fake("ardupilot")(LevelPlant(), Link(far_end, 1, 1))
     link = Link(here)
     link.send(attitude_target(0.0, (1, 1), math.nan, (0.0, 0.0, 0.0)))
     gripper = (mav.MAV_CMD_DO_GRIPPER, 0, 1.0, mav.GRIPPER_ACTION_RELEASE, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -112,8 +112,8 @@ def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
 
 def test_the_end_of_a_run_writes_logs_and_pictures(run):
     folder = run[0]
-    said = finish(folder)
-    assert "throw 1: 2.0" in said[0]
+    messages = finish(folder)
+    assert "throw 1: 2.0" in messages[0]
     assert len(list(folder.glob("throw-*.npz"))) == 1
     picture = cv2.imread(str(folder / "throw-01.png"))
     assert picture.shape[1] > 1500

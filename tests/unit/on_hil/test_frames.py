@@ -35,7 +35,7 @@ def same_turn(a, b) -> bool:
     return min(np.abs(np.subtract(a, b)).max(), np.abs(np.add(a, b)).max()) < EXACT
 
 
-def test_there_are_24_turns_and_24_mirrors_are_refused():
+def test_24_turns_exist_and_24_mirrors_are_refused():
     assert len(set(AXES)) == 24
     every = {
         ",".join(s + a for s, a in zip(signs, order))

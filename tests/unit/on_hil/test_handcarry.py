@@ -120,11 +120,11 @@ def test_moves_that_were_left_out_are_counted():
 
 
 def test_a_live_source_asks_for_the_next_move_and_left_when_all_are_made(track):
-    told, clock = [], ManualClock()
+    prompts, clock = [], ManualClock()
     later = Pose(99.0, 99.0, "vehicle", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-    steps = collect(RecordedSource([*track, later]), clock, 60.0, told.append)
+    steps = collect(RecordedSource([*track, later]), clock, 60.0, prompts.append)
     assert judge(steps, OURS).passed
-    assert [text.split(":")[0] for text in told] == [f"{i} of 8" for i in range(1, 9)]
+    assert [text.split(":")[0] for text in prompts] == [f"{i} of 8" for i in range(1, 9)]
     assert clock.time < 20.0
     clock = ManualClock()
     assert len(collect(RecordedSource(track), clock, 8.0)) < 8

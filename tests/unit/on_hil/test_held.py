@@ -8,7 +8,7 @@ from tests.configs import load_run
 from visthrow.common.errors import ConfigError
 
 
-class Told(DryRun):
+class SpyBackend(DryRun):
     """Keeps what it is sent, and when."""
 
     def __init__(self):
@@ -27,28 +27,28 @@ def test_each_command_goes_out_so_much_later_and_none_is_lost():
     """Ticks every 20 ms, a wait of 25.5 ms: two commands wait at a time; a release of the
     back-end's own is served when it is due.
     """
-    told = Told()
-    held = Held(told, 0.0255)
+    spy = SpyBackend()
+    held = Held(spy, 0.0255)
     for tick in range(3):
         held.send((float(tick), 0.0, 0.0, 0.0), 0.02 * tick)
         held.service(0.02 * tick)
-    assert [command[0] for _, command in told.sent] == [0.0]
+    assert [command[0] for _, command in spy.sent] == [0.0]
     assert held.due() == approx(0.0455)
-    told.release_due = 0.043
+    spy.release_due = 0.043
     assert held.due() == 0.043
-    told.release_due = None
+    spy.release_due = None
     held.service(held.due())
-    assert told.sent[-1] == (0.0455, (1.0, 0.0, 0.0, 0.0))
+    assert spy.sent[-1] == (0.0455, (1.0, 0.0, 0.0, 0.0))
     assert held.name == "dry-run"
 
 
 def test_nothing_goes_out_after_the_end():
-    told = Told()
-    held = Held(told, 0.02)
+    spy = SpyBackend()
+    held = Held(spy, 0.02)
     held.send((1.0, 0.0, 0.0, 0.0), 0.0)
     held.finish(0.01)
     held.service(1.0)
-    assert told.sent == []
+    assert spy.sent == []
     assert held.due() is None
 
 

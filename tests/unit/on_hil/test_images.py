@@ -86,9 +86,9 @@ def test_a_custom_detector_is_named_by_the_configuration(pictures, monkeypatch):
     with raises(ConfigError, match=r"images.by 'blind'; known: contours, learnt"):
         Eyes(params, training())
     monkeypatch.setitem(DETECTORS, "blind", Blind)
-    seen = Eyes(params, training()).look(pictures[0], 1.5)
-    assert (seen.stamp, seen.corners) == (1.5, None)
-    assert seen.ball == approx((0.0, 0.0, 1.0, 0.1))
+    detection = Eyes(params, training()).look(pictures[0], 1.5)
+    assert (detection.stamp, detection.corners) == (1.5, None)
+    assert detection.ball == approx((0.0, 0.0, 1.0, 0.1))
 
 
 class Known(Blind):
@@ -108,13 +108,13 @@ def test_what_a_camera_mounted_otherwise_sees_is_given_in_that_of_training(pictu
     """
     monkeypatch.setitem(DETECTORS, "known", Known)
     mount = replace(training().mount, rpy_deg=(0.0, -30.0, 0.0))
-    seen = Eyes(ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()).look(
-        pictures[0], 0.0
-    )
+    detection = Eyes(
+        ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()
+    ).look(pictures[0], 0.0)
     sine, cosine = 0.5, math.sqrt(0.75)
-    assert seen.ball == approx((0.0, -sine, cosine, 0.1))
+    assert detection.ball == approx((0.0, -sine, cosine, 0.1))
     turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
-    assert_allclose(seen.corners, Known.corners @ turn.T, atol=1e-12)
+    assert_allclose(detection.corners, Known.corners @ turn.T, atol=1e-12)
 
 
 @fixture(scope="module")
@@ -301,7 +301,7 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys, ref
     try:
         assert "all bit for bit the same" in printed(f"hil replay {out}")
         refused(
-            f"hil record --out {tmp_path}/b", sets=settings, said="expected lines of file,time_s"
+            f"hil record --out {tmp_path}/b", sets=settings, message="expected lines of file,time_s"
         )
     finally:
         (folder / "away").rename(folder / STAMPS)

@@ -163,8 +163,8 @@ def test_what_the_fields_mean():
     assert pose_from_message(odometry(vel=(math.nan, 0.0, 0.0)), "vehicle", 0.0).vel is None
     for none in (math.nan, 0.0):  # what turns the velocity is not known, so neither is the velocity
         assert pose_from_message(odometry(q=(none,) * 4), "payload", 0.0).vel is None
-        told = odometry(child=20, q=(none,) * 4)
-        assert pose_from_message(told, "payload", 0.0).vel == (1.0, 2.0, 3.0)
+        message = odometry(child=20, q=(none,) * 4)
+        assert pose_from_message(message, "payload", 0.0).vel == (1.0, 2.0, 3.0)
     assert pose_from_message(odometry(frame=0), "vehicle", 0.0) is None
     assert pose_from_message(MESSAGES[3], "vehicle", 0.0) is None
 
@@ -220,9 +220,9 @@ def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
 
 
 def test_a_device_that_names_its_peer_hears_nobody_else():
-    number, said = free_port(), []
+    number, messages = free_port(), []
     ours = Link(
-        open_port(check_device(f"udpout:127.0.0.1:{number}")), roster=Roster(tell=said.append)
+        open_port(check_device(f"udpout:127.0.0.1:{number}")), roster=Roster(tell=messages.append)
     )
     peer = Link(open_port(check_device(f"udp:127.0.0.1:{number}")), 1, 1)
     heard = []
@@ -235,7 +235,7 @@ def test_a_device_that_names_its_peer_hears_nobody_else():
         peer.send(MESSAGES[0])
         ours.pump(lambda: 0.0)
         assert heard == ["ATT_POS_MOCAP"]
-        assert said == [
+        assert messages == [
             f"refused: datagram from 127.0.0.1:{stranger.getsockname()[1]}: the link's device is"
             f" 127.0.0.1:{number}"
         ]

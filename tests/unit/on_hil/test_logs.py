@@ -250,9 +250,9 @@ def test_a_log_is_recorded_and_replayed(tmp_path, printed):
         f"source.logs=[{logs}]",
     )
     out = tmp_path / "run"
-    told = printed(f"hil record --out {out}", sets=settings)
-    assert "vehicle: 60 poses taken; refused: none" in told
-    assert "payload: 60 poses taken; refused: none" in told
+    output = printed(f"hil record --out {out}", sets=settings)
+    assert "vehicle: 60 poses taken; refused: none" in output
+    assert "payload: 60 poses taken; refused: none" in output
     assert "all bit for bit the same" in printed(f"hil replay {out}")
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == approx(1.333, abs=0.01), "down became up"

@@ -47,11 +47,11 @@ class System:
 
 def test_rigid_bodies_by_name_from_a_separate_thread():
     frames = [{"quad": body(1.0), "other": body(9.0)}, {"ball": body(2.0), "quad": body(1.5)}]
-    system, asked, now = System(frames), [], [5.0]
-    module = SimpleNamespace(connect=lambda *args: asked.append(args) or system)
+    system, connections, now = System(frames), [], [5.0]
+    module = SimpleNamespace(connect=lambda *args: connections.append(args) or system)
     params = MocapParams("qualisys", "127.0.0.1", settings={"port": "22223"})
     source = MotionCaptureSource(params, BODIES, lambda: now[0], module=module)
-    assert asked == [("qualisys", {"hostname": "127.0.0.1", "port": "22223"})]
+    assert connections == [("qualisys", {"hostname": "127.0.0.1", "port": "22223"})]
     assert source.poll(0.0) == [], "polling never waits"
     system.next.release()
     eventually(lambda: source._waiting)
@@ -77,17 +77,17 @@ def test_a_frame_that_raises_is_dropped_and_counted():
 
     short = SimpleNamespace(position=[1.0, 2.0], rotation=body(0.0).rotation)
     frames = [{"quad": Occluded(), "ball": body(1.0)}, {"quad": short, "ball": body(2.0)}]
-    system, said = System(frames), []
+    system, messages = System(frames), []
     module = SimpleNamespace(connect=lambda *args: system)
-    source = MotionCaptureSource(PARAMS, BODIES, lambda: 1.0, module=module, tell=said.append)
+    source = MotionCaptureSource(PARAMS, BODIES, lambda: 1.0, module=module, tell=messages.append)
     for _ in range(5):  # two frames, and three that the package does not have: it raises
         system.next.release()
     eventually(lambda: source.roster.refused == 5)
     assert [(p.body, p.pos[0]) for p in source.poll(0.0)] == [("payload", 1.0), ("payload", 2.0)]
     assert source.failure is None
-    assert len(said) == 3, "each kind once"
-    assert "body quad from 127.0.0.1: RuntimeError: occluded" in said[0]
-    assert "frame from 127.0.0.1: StopIteration" in said[2]
+    assert len(messages) == 3, "each kind once"
+    assert "body quad from 127.0.0.1: RuntimeError: occluded" in messages[0]
+    assert "frame from 127.0.0.1: StopIteration" in messages[2]
     source.close()
 
 
@@ -123,13 +123,13 @@ def package(tmp_path, monkeypatch):
 def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, monkeypatch):
     package(CRASHES)
     monkeypatch.setattr("hil.poses.sources.motion_capture.RESTART_DELAY", 0.05)
-    said = []
+    messages = []
     patient = replace(PARAMS, timeout=30.0)
-    source = MotionCaptureSource(patient, BODIES, time.monotonic, tell=said.append)
+    source = MotionCaptureSource(patient, BODIES, time.monotonic, tell=messages.append)
     source.hold(True)
     eventually(lambda: source.failure is not None)
     assert len(source.poll(0.0)) == 19
-    assert said == [
+    assert messages == [
         "motion capture stopped: SourceError: its process ended with -6; it is started again on the"
         " ground"
     ]
@@ -138,7 +138,7 @@ def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, mo
     source.hold(False)
     eventually(lambda: source.failure is None)
     eventually(lambda: source.poll(0.0))
-    assert said[1] == "motion capture is connected again"
+    assert messages[1] == "motion capture is connected again"
     source.close()
 
 
@@ -163,9 +163,9 @@ def connect(kind, options):
 def test_the_package_hears_the_host_alone(package):
     """Whatever sockets it opens, other senders' datagrams do not get to them, and are counted."""
     package(HEARS_ANYBODY)
-    port, said = free_port(), []
+    port, messages = free_port(), []
     params = replace(PARAMS, timeout=30.0, settings={"port": str(port)})
-    source = MotionCaptureSource(params, BODIES, time.monotonic, tell=said.append)
+    source = MotionCaptureSource(params, BODIES, time.monotonic, tell=messages.append)
     senders = {}
     for host in ("127.0.0.1", "127.0.0.2"):
         senders[host] = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -178,7 +178,7 @@ def test_the_package_hears_the_host_alone(package):
         time.sleep(0.05)
         taken += [pose.pos[0] for pose in source.poll(0.0)]
     assert set(taken[1:]) == {1.0}, "the first may come before the filter"
-    assert "datagram from others: source.mocap.host is 127.0.0.1" in said[0]
+    assert "datagram from others: source.mocap.host is 127.0.0.1" in messages[0]
     for one in senders.values():
         one.close()
     source.close()

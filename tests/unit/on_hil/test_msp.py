@@ -22,7 +22,7 @@ def test_published_bytes():
 
 
 @mark.parametrize("payload", [b"", b"\x00", b"$M<$X>", bytes(range(200))])
-def test_there_and_back_in_any_pieces(payload):
+def test_a_round_trip_in_any_pieces(payload):
     frame = msp.Frame(105, payload, msp.ANSWER)
     data = b"noise$" + msp.pack(frame) + b"$M>" + msp.pack(frame)
     for size in (1, 2, 3, 7, len(data)):
@@ -66,7 +66,7 @@ def fuzz(count: int, seed: int) -> None:
     """Random bytes, mutated frames and whole answers of every command with any content, into parser
     and back-end.
     """
-    here, there = pipe()
+    here, far_end = pipe()
     backend = Betaflight(here, PARAMS)
     rng, sent, parsed = np.random.default_rng(seed), [], msp.FrameParser()
     seeds = [
@@ -78,8 +78,8 @@ def fuzz(count: int, seed: int) -> None:
         if i % 50 == 0:
             backend.service(0.01 * i)
             backend.status(0.01 * i)
-            while there.inbox:
-                sent += [f.command for f in parsed.parse(there.inbox.popleft())]
+            while far_end.inbox:
+                sent += [f.command for f in parsed.parse(far_end.inbox.popleft())]
     assert backend.parser.errors > count // 50, "some must be no frames"
     assert {msp.SET_RAW_RC, msp.SET_RC_TUNING, msp.EEPROM_WRITE}.isdisjoint(sent), (
         "nothing of it commands or writes"

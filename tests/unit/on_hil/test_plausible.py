@@ -143,7 +143,9 @@ def test_a_recording_in_wrong_units_is_refused_unless_they_are_named(tmp_path, r
     assert isinstance(open_source(lax, tmp_path, MonotonicClock())[2], ManualClock)
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
-    refused(f"hil check --config crazyflie_log --set {file} --set", wrong, said="no column 'acc'; ")
+    refused(
+        f"hil check --config crazyflie_log --set {file} --set", wrong, message="no column 'acc'; "
+    )
 
 
 def test_a_run_recorded_with_another_form_of_mapping_replays(tmp_path, printed):

@@ -40,13 +40,13 @@ def test_the_inverse_is_as_near_as_microseconds_allow(params):
     sticks = Sticks(params)
     for axis in range(3):
         for i in range(-40, 41):
-            wanted = i / 40 * sticks.limits[axis]
-            us = sticks.position(axis, wanted)
+            rate = i / 40 * sticks.limits[axis]
+            us = sticks.position(axis, rate)
             assert 1000 <= us <= 2000
-            off = abs(rate_at(params, axis, us) - wanted)
+            off = abs(rate_at(params, axis, us) - rate)
             for other in (us - 1, us + 1):
                 if 1000 <= other <= 2000:
-                    assert off <= abs(rate_at(params, axis, other) - wanted) + 1e-12
+                    assert off <= abs(rate_at(params, axis, other) - rate) + 1e-12
 
 
 def test_which_way_is_which():

@@ -6,13 +6,13 @@ import os
 from hil.control.realtime import RealtimeParams, keep, prepare
 
 
-def test_nothing_is_asked_for_by_default(monkeypatch):
+def test_nothing_is_requested_by_default(monkeypatch):
     monkeypatch.setattr(os, "sched_setscheduler", None)
     monkeypatch.setattr(ctypes, "CDLL", None)
     assert prepare(RealtimeParams()) == keep(RealtimeParams()) == []
 
 
-def test_a_refusal_is_said_with_its_reason(monkeypatch):
+def test_a_refusal_is_reported_with_its_reason(monkeypatch):
     def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 

@@ -106,8 +106,8 @@ def test_a_folder_that_cannot_be_made(tmp_path, capsys):
     (tmp_path / "file").touch()
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
     assert run_command(f"hil run --out {tmp_path}/file/run --set {device}") == 2
-    assert "cannot write" in (said := capsys.readouterr().err)
-    assert "--out" in said
+    assert "cannot write" in (error := capsys.readouterr().err)
+    assert "--out" in error
 
 
 def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
@@ -120,7 +120,7 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
     first = tmp_path / "first"
     shutil.copytree(run_folder, first)
     (first / "link.tlog").write_bytes(b"of the first run")
-    refused(f"hil run --out {first} --set {device}", said="holds a run already")
+    refused(f"hil run --out {first} --set {device}", message="holds a run already")
     assert (first / "link.tlog").read_bytes() == b"of the first run"
     late = [
         "--config",
@@ -128,18 +128,18 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
         "--set",
         "betaflight.device=tcp:127.0.0.1:9",
     ]  # nobody listens there
-    refused(f"hil run --out {tmp_path}/new --set {device}", *late, said="cannot connect")
+    refused(f"hil run --out {tmp_path}/new --set {device}", *late, message="cannot connect")
     assert not (tmp_path / "new").exists()
 
 
 def test_a_view_is_a_recording(run_folder, tmp_path, refused):
-    refused(f"hil view {run_folder} --out {tmp_path}/a.txt", said="ends in .rrd or .mcap")
+    refused(f"hil view {run_folder} --out {tmp_path}/a.txt", message="ends in .rrd or .mcap")
     assert not (tmp_path / "a.txt").exists()
 
 
 def test_the_folder_holds_config_policy_and_hash(run_folder):
-    wanted, policy, ticks = load_run(run_folder)
-    assert wanted == params("policy=vision", "observe=true")
+    loaded, policy, ticks = load_run(run_folder)
+    assert loaded == params("policy=vision", "observe=true")
     assert policy.obs_dim == Policy.load(find_policy("vision")).obs_dim
     record = json.loads((run_folder / "provenance.json").read_text())
     assert record["policy"] == "vision"
@@ -147,7 +147,7 @@ def test_the_folder_holds_config_policy_and_hash(run_folder):
     assert {pose.body for line in ticks for pose in line["poses"]} == {"vehicle", "payload"}
     assert len(ticks) > 200
     with raises(StorageError, match="holds a run already"):
-        RunRecorder(run_folder, wanted)
+        RunRecorder(run_folder, loaded)
 
 
 CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(
@@ -198,10 +198,10 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused, printe
     assert "vehicle: 300 poses taken; refused: none" in text.out
     assert "throws 0, released 0" in text.out
     _, _, ticks = load_run("run")
-    asked = [line for line in ticks if line["action"] is not None]
-    assert len(asked) > 140
-    assert len(asked[0]["keypoints"]) == 8
-    vel = np.array(asked[-1]["observation"][3:6])
+    acted = [line for line in ticks if line["action"] is not None]
+    assert len(acted) > 140
+    assert len(acted[0]["keypoints"]) == 8
+    vel = np.array(acted[-1]["observation"][3:6])
     np.testing.assert_allclose(vel, (0.03, 0.0, 0.0), atol=1e-4)
     assert run_command("hil replay run") == 0
     out = printed("hil check --config mine.toml --seconds 2")
@@ -217,7 +217,7 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused, printe
         "recorded to the end although the checks fail"
     )
     assert len(load_run("looked")[2]) == len(ticks)
-    refused("hil run --config mine.toml --out run", said="holds a run already")
+    refused("hil run --config mine.toml --out run", message="holds a run already")
 
 
 def test_a_run_whose_poses_cease_in_flight_is_packed_and_fails(tmp_path, monkeypatch, capsys):

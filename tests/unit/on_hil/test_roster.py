@@ -25,18 +25,18 @@ def pose(**ids):
 
 
 def roster(*parties, **more):
-    said = []
-    return Roster(parties or (AUTOPILOT, VEHICLE, BALL), tell=said.append, **more), said
+    messages = []
+    return Roster(parties or (AUTOPILOT, VEHICLE, BALL), tell=messages.append, **more), messages
 
 
 def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
     """A bridge of the motion capture that uses the vehicle's own ids, beside the vehicle."""
-    who, said = roster()
+    who, messages = roster()
     assert who.admit(pose(), A, 0.0)
     assert who.admit(beat(), B, 0.1)
     assert who.admit(wired(odometry(), system=42, component=7), A, 0.2)
     assert who.at == {"vehicle": A, "autopilot": B, "payload": A}
-    assert (who.refused, said) == (0, [])
+    assert (who.refused, messages) == (0, [])
     assert who.addresses(mav.MAVLink_command_long_message(1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)) == (B,)
     assert set(who.addresses(mav.MAVLink_timesync_message(0, 1))) == {A, B}
     sync = wired(mav.MAVLink_timesync_message(5, 6))
@@ -46,7 +46,7 @@ def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
 
 
 def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
-    who, said = roster(AUTOPILOT)
+    who, messages = roster(AUTOPILOT)
     other = wired(mav.MAVLink_sys_status_message(0, 0, 0, 0, 12000, 0, 0, 0, 0, 0, 0, 0, 0))
     assert not who.admit(other, A, 0.0)
     assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.1)
@@ -57,7 +57,7 @@ def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
         "at its own address as well"
     )
     assert who.refused == 2, "what came too early is of no stranger"
-    assert said == [
+    assert messages == [
         (
             "refused: HEARTBEAT of system 1, component 1 from 127.0.0.1:1001: it is a"
             " ARDUPILOTMEGA, expected is a PX4"
@@ -65,11 +65,11 @@ def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
     ]
 
 
-def test_a_stranger_is_refused_counted_and_said_once():
-    who, said = roster()
+def test_a_stranger_is_refused_counted_and_reported_once():
+    who, messages = roster()
     for i in range(50):
         assert not who.admit(pose(system=9, component=9), C, 0.01 * i)
-    (line,) = said
+    (line,) = messages
     assert line.startswith(
         "refused: ATT_POS_MOCAP of system 9, component 9 from 10.0.0.9:14550: nobody of this run,"
         " which expects"
@@ -78,17 +78,17 @@ def test_a_stranger_is_refused_counted_and_said_once():
     assert who.summary()["refused_most"][0]["count"] == who.refused == 50
 
 
-def test_what_a_party_sends_beside_its_role_is_neither_taken_nor_said():
-    who, said = roster(VEHICLE)
+def test_messages_outside_of_a_partys_role_are_neither_taken_nor_reported():
+    who, messages = roster(VEHICLE)
     assert who.admit(pose(), A, 0.0)
     assert not who.admit(beat(), A, 0.1)
-    assert (who.refused, said) == (0, [])
+    assert (who.refused, messages) == (0, [])
     assert not who.admit(beat(), B, 0.1)
     assert who.refused == 1
 
 
 def test_on_the_ground_a_party_that_fell_silent_comes_back_from_another_address():
-    who, said = roster()
+    who, messages = roster()
     back = []
     who.moved.append(back.append)
     assert who.admit(beat(), A, 0.0)
@@ -96,7 +96,7 @@ def test_on_the_ground_a_party_that_fell_silent_comes_back_from_another_address(
     assert who.admit(beat(), A, SILENT)
     assert not who.admit(beat(), B, 2.0 * SILENT - 0.1)
     assert who.admit(beat(), B, 2.0 * SILENT + 0.1)
-    assert (who.at["autopilot"], back, said[-1]) == (
+    assert (who.at["autopilot"], back, messages[-1]) == (
         B,
         [AUTOPILOT],
         "the autopilot speaks from 127.0.0.1:1002 now",
@@ -120,14 +120,14 @@ def test_in_flight_no_address_changes():
 
 
 def test_only_those_on_the_list_are_looked_at():
-    who, said = roster(allow=("10.0.0.9", "127.0.0.1:1002"))
+    who, messages = roster(allow=("10.0.0.9", "127.0.0.1:1002"))
     assert [who.shuts_out(address) for address in (A, B, C, ("10.0.0.9", 5))] == [
         True,
         False,
         False,
         False,
     ]
-    assert said == ["refused: datagram from 127.0.0.1:1001: not on link.allow"]
+    assert messages == ["refused: datagram from 127.0.0.1:1001: not on link.allow"]
 
 
 @mark.parametrize("text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"])
@@ -137,12 +137,12 @@ def test_a_list_of_allowed_senders_holds_addresses(text):
 
 
 def test_no_flood_fills_the_memory():
-    who, said = roster()
+    who, messages = roster()
     for i in range(20_000):
         who.admit(pose(system=9, component=i % 256), ("10.0.0.9", 1 + i), 0.0)
     assert len(who.received) <= MOST_KEPT + 1
     assert who.refused == 20_000
-    assert len(said) <= 20
+    assert len(messages) <= 20
 
 
 def test_a_fake_says_that_it_is_one():

@@ -248,11 +248,11 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     pilot.detections = Detections(pilot.pilot.camera, 0.1)
 
     def watch(time, decision):
-        seen = {
+        rays_by_thing = {
             thing: None if thing == name and hidden[0] <= time < hidden[1] else rays
             for thing, rays in shown.items()
         }
-        older, newest = Detection(time - 0.01, None, None), Detection(time, *seen.values())
+        older, newest = Detection(time - 0.01, None, None), Detection(time, *rays_by_thing.values())
         pilot.estimator.take_detections([older, newest])
 
     decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
@@ -406,14 +406,14 @@ class HoldingSpy(Spy):
 
     def __init__(self):
         super().__init__()
-        self.asked = []
+        self.times = []
 
     def ask(self, mode, now):
         if mode != "follow":
-            self.asked.append(now)
+            self.times.append(now)
 
     def abort(self, now):
-        self.asked.append(now)
+        self.times.append(now)
 
 
 @mark.parametrize("reported", [False, True])
@@ -436,7 +436,7 @@ def test_a_tilted_vehicle_without_poses_is_levelled_before_it_is_handed_over(rep
         return Status(True, rates=rates)
 
     fly(pilot, 4.0, poses=stopped, status=status)
-    handed = round(pilot.backend.asked[0], 2)
+    handed = round(pilot.backend.times[0], 2)
     assert math.degrees(max(tilts.values())) > 80.0, "the policy goes on for a while"
     assert math.degrees(tilts[handed]) < 25.0
     assert handed - gone[0] < 0.4

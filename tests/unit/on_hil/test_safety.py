@@ -88,12 +88,12 @@ def test_the_guard_limits_each_command_and_its_change(axis, side):
     start = [7.0, 0.0, 0.0, 0.0]
     assert guard.check(tuple(start)) == tuple(start)
     limit = high if side > 0 else low
-    wanted = list(start)
-    wanted[axis] = limit + side * 5.0
-    sent, steps = guard.check(tuple(wanted)), 1
+    command = list(start)
+    command[axis] = limit + side * 5.0
+    sent, steps = guard.check(tuple(command)), 1
     assert sent[axis] == approx(start[axis] + side * slew), "one step of the slew limit"
     while sent[axis] != limit:
-        sent, steps = guard.check(tuple(wanted)), steps + 1
+        sent, steps = guard.check(tuple(command)), steps + 1
         assert steps < 10
     assert guard.clipped == steps
     assert guard.slewed == steps - 1 or abs(limit - start[axis]) % slew == 0.0
@@ -118,11 +118,11 @@ def test_what_is_not_finite_is_refused_and_counted(bad, axis):
 
 
 @mark.parametrize(
-    ("wanted_deg", "heading_deg", "good"),
+    ("configured_deg", "heading_deg", "good"),
     [(0.0, 9.0, True), (0.0, 11.0, False), (175.0, -176.0, True), (-175.0, 174.0, False)],
 )
-def test_a_heading_is_compared_across_180_degrees(wanted_deg, heading_deg, good):
-    check = replace(params().check, heading_deg=wanted_deg, heading_tolerance_deg=10.0)
+def test_a_heading_is_compared_across_180_degrees(configured_deg, heading_deg, good):
+    check = replace(params().check, heading_deg=configured_deg, heading_tolerance_deg=10.0)
     quat = tuple(Rotation.from_euler("z", heading_deg, degrees=True).as_quat())
     vehicle, payload = replace(body(), quat=quat), body((0.0, 0.0, 1.0))
     failed = failed_checks(check, FENCE, vehicle, payload, (1.0, 0.0, 0.0), MIDDLE, 0.5)

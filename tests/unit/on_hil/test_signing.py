@@ -17,8 +17,8 @@ WORD = mav.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3)
 
 
 def pair(theirs=KEY):
-    here, there = pipe()
-    got, link, peer = [], Link(here, key=KEY), Link(there, 1, 1, key=theirs)
+    here, far_end = pipe()
+    got, link, peer = [], Link(here, key=KEY), Link(far_end, 1, 1, key=theirs)
     link.listen(lambda message, arrival: got.append(message.get_type()))
     return link, peer, got
 

@@ -98,11 +98,11 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
         (local_position(), 25),
     ]
     if live:
-        here, there = pipe()
+        here, far_end = pipe()
         parties = [Party(b.body, b.system, b.component, frozenset({b.message})) for b in senders]
         source = MavlinkSource(Link(here, roster=Roster(parties)), senders, lambda: 1.0)
         for message, component in packed:
-            there.write(message.pack(mav.MAVLink(None, 1, component)))
+            far_end.write(message.pack(mav.MAVLink(None, 1, component)))
         assert source.poll(1.0) == []
         (roster,) = source.rosters
     else:

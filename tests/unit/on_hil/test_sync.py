@@ -24,9 +24,9 @@ def exchanges(sync, clock, seconds, start=0.0, most=12e-3):
     rng, errors = np.random.default_rng(0), []
     for i in range(int(seconds * RATE)):
         sent = start + i / RATE
-        there, back = rng.uniform(1e-3, most, 2)
-        now = sent + there + back
-        sync.take(int(clock(sent + there) * 1e9), TimeSync.stamp(sent), now)
+        forth, back = rng.uniform(1e-3, most, 2)
+        now = sent + forth + back
+        sync.take(int(clock(sent + forth) * 1e9), TimeSync.stamp(sent), now)
         errors.append(sync.offset - (clock(now) - now))
     return np.array(errors)
 
@@ -82,10 +82,10 @@ def dated(offset, stamp_offset=None):
     """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet
     another clock.
     """
-    here, there = pipe()
+    here, far_end = pipe()
     fake = FakeArduPilot(
         LevelPlant(),
-        Link(there, *VEHICLE_ID),
+        Link(far_end, *VEHICLE_ID),
         FakeMocapParams(loss=0.0),
         0,
         FakeOptions(clock_offset=offset),
@@ -122,8 +122,8 @@ def test_stamps_of_another_clock_are_not_believed():
 
 
 def test_a_peer_that_asks_is_answered_with_our_time():
-    here, there = pipe()
-    ours, peer = Link(here), Link(there, *VEHICLE_ID)
+    here, far_end = pipe()
+    ours, peer = Link(here), Link(far_end, *VEHICLE_ID)
     LinkSync(ours)
     heard = []
     peer.listen(lambda message, arrival: heard.append(message))

@@ -75,12 +75,12 @@ def test_ctrl_z_does_not_stop_it_in_mid_flight(typed, number):
 
 
 def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
-    said, simulated = [], []
-    terminal = Terminal(True, lambda: bool(simulated), said.append)
+    messages, simulated = [], []
+    terminal = Terminal(True, lambda: bool(simulated), messages.append)
     assert not terminal.words("ready").arm
     assert not terminal.words("ready").arm
-    assert len(said) == 1
-    assert "does not say that it is simulated" in said[0]
+    assert len(messages) == 1
+    assert "does not say that it is simulated" in messages[0]
     simulated.append(1)
     assert not terminal.words("check").arm
     assert terminal.words("ready").arm

@@ -13,7 +13,7 @@ from visthrow.onboard.hover import GRAVITY
 BENT = HoverThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
 
 
-def test_there_and_back():
+def test_the_inverse_restores_the_thrust():
     for thrust in (0.6, 1.0, 2.668, 4.0, 6.0):
         assert BENT.thrust(BENT.share(thrust)) == approx(thrust)
     assert BENT.share(2.668) == approx(0.37)

@@ -106,10 +106,10 @@ def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
     attached = Channel(columns["time"], ~gone, "bool")
     pressed = Channel(columns["time"], gone, "1")
     known = ({"attached": attached}, {"release_command": pressed}, {})
-    told = [check([kept, log_of(lighter, **more)]) for more in known]
+    checks = [check([kept, log_of(lighter, **more)]) for more in known]
     assert [
         any("the thrust's scale differs" in row.text for one in found for row in one.rows)
-        for found in told
+        for found in checks
     ] == [False, False, True]
 
 
@@ -317,10 +317,10 @@ def test_commands_that_oppose_a_swing_are_not_late():
     angle = rate = np.zeros(3)
     rows = []
     for pushed in np.transpose(push) * [1.0, 1.0, 0.3]:
-        asked = -gain * angle
-        rate = rate + 0.01 * ((asked - rate) / lag + pushed)
+        rate_command = -gain * angle
+        rate = rate + 0.01 * ((rate_command - rate) / lag + pushed)
         angle = angle + 0.01 * rate
-        rows.append((2.0, *asked, *rate))
+        rows.append((2.0, *rate_command, *rate))
     columns = np.array(rows)
     rates = columns[:, 4:] + rng.normal(0.0, 0.01, (len(time), 3))
     log = log_of({"time": time, "command": columns[:, :4], "rate_b": rates})
@@ -328,7 +328,7 @@ def test_commands_that_oppose_a_swing_are_not_late():
 
 
 @mark.parametrize(
-    ("late", "step", "told"),
+    ("late", "step", "reported"),
     [
         (-0.03, 0.01, False),
         (0.02, 0.01, False),
@@ -337,14 +337,14 @@ def test_commands_that_oppose_a_swing_are_not_late():
         (0.3, 0.2, True),
     ],
 )
-def test_a_payload_that_leaves_before_its_command_is_reported(late, step, told):
+def test_a_payload_that_leaves_before_its_command_is_reported(late, step, reported):
     columns = carrying()
     gone = np.maximum(columns["time"] - 6.0, 0.0)
     columns["payload_pos_w"] -= np.outer(gone, [2.4, 0.0, 3.2])
     stamps = np.arange(step - 0.01, 10.0, step)
     pressed = Channel(stamps, (stamps > 6.0 + late).astype(float), "1")
-    said = faults(log_of(columns, release_command=pressed))
-    assert ("before its release is commanded" in said) == told
+    text = faults(log_of(columns, release_command=pressed))
+    assert ("before its release is commanded" in text) == reported
 
 
 def test_a_payload_that_waits_on_the_floor_does_not_leave_before_its_command():
@@ -387,12 +387,12 @@ def test_a_delay_that_noise_hides_is_not_reported(width):
         assert abs(found.delay) < 2.0 * found.delay_sd
 
 
-@mark.parametrize(("count", "clipped", "told"), [(60, 0, False), (60, 6, True), (40, 0, False)])
-def test_the_least_of_few_samples_is_no_rail(count, clipped, told):
+@mark.parametrize(("count", "clipped", "reported"), [(60, 0, False), (60, 6, True), (40, 0, False)])
+def test_the_least_of_few_samples_is_no_rail(count, clipped, reported):
     values = default_rng(0).normal(0.0, 1.0, (count, 3))
     values[:clipped, 0] = np.max(values)
     log = log_at(0.02 * np.arange(count), rate_b=values)
-    assert ("saturated" in " ".join(row.text for row in check([log])[0].rows)) == told
+    assert ("saturated" in " ".join(row.text for row in check([log])[0].rows)) == reported
 
 
 def test_gaps_and_clocks():
@@ -446,10 +446,10 @@ def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, ca
     log_of(columns).save(tmp_path / "a.npz")
     run_command(f"diagnose explain {tmp_path}/a.npz --no-report --json {tmp_path}/a.json")
     assert "DATA INCONSISTENT" in capsys.readouterr().out
-    said = json.loads((tmp_path / "a.json").read_text())
-    assert said["overall"] == "DATA INCONSISTENT"
+    answer = json.loads((tmp_path / "a.json").read_text())
+    assert answer["overall"] == "DATA INCONSISTENT"
     bad = [row.name for row in check([log_of(columns)])[0].rows if row.verdict == "bad"]
-    assert all(any(f": {name}: " in reason for reason in said["reasons"]) for name in bad)
+    assert all(any(f": {name}: " in reason for reason in answer["reasons"]) for name in bad)
     assert not contradictions(check([log_of(columns)]), frozenset(bad))
     assert cli.main([*EXPLAIN, str(tmp_path / "a.npz"), "--overrule", "units nothing"]) == 2
     error = capsys.readouterr().err
@@ -572,9 +572,9 @@ def test_the_plant_says_how_long_the_cable_must_be(tmp_path, capsys):
     hung = columns | {"payload_pos_w": columns["pos_w"] - [0.0, 0.0, 0.9]}
     log_of(hung).save(tmp_path / "a.npz")
     command = ["diagnose", "check", str(tmp_path / "a.npz"), "--no-pictures"]
-    for plant, told in (([], False), (["--plant", "state"], True)):
+    for plant, reported in (([], False), (["--plant", "state"], True)):
         cli.main([*command, *plant])
-        assert ("another cable" in capsys.readouterr().out) == told
+        assert ("another cable" in capsys.readouterr().out) == reported
 
 
 def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(
@@ -595,11 +595,11 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(
     check_with = "diagnose check --no-pictures --config"
     unused = "is not used: it states how to read the columns of a table"
     for words in ("mine.toml a.npz", "mine.toml a.npz+b.npz", "pendulum_encoder a.npz"):
-        refused(f"{check_with} {words}", said=unused)
-    refused("diagnose explain a.npz --config mine.toml", said=unused)
+        refused(f"{check_with} {words}", message=unused)
+    refused("diagnose explain a.npz --config mine.toml", message=unused)
     refused(
         "diagnose explain t.csv --config mine.toml",
-        said="where that holds a model, such as [flyer]",
+        message="where that holds a model, such as [flyer]",
     )
     for words in ("mine.toml a.npz t.csv", "cf_payload a.npz"):
         assert run_command(f"{check_with} {words}") in (0, 1)

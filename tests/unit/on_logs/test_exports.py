@@ -247,7 +247,7 @@ def test_angles_in_degrees_are_no_position(proposed):
     assert "quad.Rotation.X [deg]" in found.left_out
 
 
-ASKED = {
+QUESTIONS = {
     "gyro.x,gyro.y,gyro.z,acc.x,acc.y,acc.z": "rad/s or deg/s",
     "omega_x,omega_y,omega_z,acc_x,acc_y,acc_z": "rad/s or deg/s",
     "controller.r_roll,controller.r_pitch,controller.r_yaw,a,b,c": "body rates",
@@ -255,13 +255,13 @@ ASKED = {
 }
 
 
-@pytest.mark.parametrize("head", ASKED)
-def test_what_nothing_checks_is_asked(head, proposed):
+@pytest.mark.parametrize("head", QUESTIONS)
+def test_what_nothing_checks_becomes_a_question(head, proposed):
     rng = np.random.default_rng(0)
     rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
     acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
     _, found, _ = proposed(table_with(head, rates, acc))
-    assert asks(found, ASKED[head])
+    assert asks(found, QUESTIONS[head])
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])

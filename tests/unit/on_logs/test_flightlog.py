@@ -50,7 +50,7 @@ def test_hold_returns_the_last_valid_sample(log):
 
 
 @mark.parametrize(
-    ("time", "values", "valid", "said"),
+    ("time", "values", "valid", "message"),
     [
         ([0.0, 1.0], [1.0], None, r"time \(2,\), values \(1,\)"),
         ([0.0, 1.0], [1.0, 2.0], [True], r"validity \(1,\)"),
@@ -61,8 +61,8 @@ def test_hold_returns_the_last_valid_sample(log):
         ([0.0], ["x"], None, "numbers or bools"),
     ],
 )
-def test_contradictory_channels_are_refused(time, values, valid, said):
-    with raises(LogError, match=said):
+def test_contradictory_channels_are_refused(time, values, valid, message):
+    with raises(LogError, match=message):
         Channel(
             np.array(time),
             np.array(values),

@@ -74,7 +74,7 @@ def blackbox(path: Path) -> None:
     path.write_bytes((REAL / "betaflight_bbl" / "btfl_001_start.bbl").read_bytes()[:14_000])
 
 
-def own() -> FlightLog:
+def make_log() -> FlightLog:
     """A log of ours."""
     time, rng = 0.01 * np.arange(SAMPLES), np.random.default_rng(0)
     log = log_at(time, pos_w=rng.normal(size=(SAMPLES, 3)), attached=time < time[SAMPLES // 2])
@@ -101,9 +101,9 @@ FORMATS: dict[str, Callable[[Path], object]] = {
     "a.BIN": dataflash,
     "a.tlog": lambda path: write_tlog(path, lambda mav, i: []),
     "a.bbl": blackbox,
-    "a.npz": lambda path: own().save(path),
-    "export.csv": lambda path: export(own(), path),
-    "export.parquet": lambda path: export(own(), path),
+    "a.npz": lambda path: make_log().save(path),
+    "export.csv": lambda path: export(make_log(), path),
+    "export.parquet": lambda path: export(make_log(), path),
     "payload.csv": lambda path: path.write_bytes(payload_table()),
     "payload.csv.gz": lambda path: path.write_bytes(gzip.compress(payload_table())),
     "payload.csv.xz": lambda path: path.write_bytes(lzma.compress(payload_table())),
@@ -160,15 +160,15 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
 def looked_at(path: Path) -> bool:
     """Read and check a file; False where an error says why not."""
     mapping = setups.load("cf_payload").table if path.name.startswith("payload") else None
-    said = ""
+    message = ""
     try:
         with patience():
             for checked in check(read(path, mapping)):
                 table(checked)
     except VisthrowError as error:
-        said = str(error)
-    assert not said or path.name in said
-    return not said
+        message = str(error)
+    assert not message or path.name in message
+    return not message
 
 
 def all_of(name: str, folder: Path, count: int) -> list[bool]:
@@ -176,12 +176,12 @@ def all_of(name: str, folder: Path, count: int) -> list[bool]:
     FORMATS[name](path)
     whole = path.read_bytes()
     assert looked_at(path)
-    said = []
+    readable = []
     for i in range(count):
         cut = whole[: len(whole) * i // (count // 3)]  # a third of them cut short, evenly
         path.write_bytes(cut if i < count // 3 else damaged(whole, chance))
-        said.append(looked_at(path))
-    return said
+        readable.append(looked_at(path))
+    return readable
 
 
 MANY = 300
@@ -189,8 +189,8 @@ MANY = 300
 
 @mark.parametrize("name", list(FORMATS))
 def test_damaged_files(name, tmp_path):
-    said = all_of(name, tmp_path, DAMAGES)
-    assert not said[0]  # nothing at all
+    readable = all_of(name, tmp_path, DAMAGES)
+    assert not readable[0]  # nothing at all
 
 
 def test_a_length_that_leads_back_is_no_circle(tmp_path):
@@ -211,10 +211,10 @@ def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
     data[9000:9300] = bytes(300)
     path.write_bytes(data)
     code = run_command(f"diagnose check {path} --no-pictures --all")
-    said = capfd.readouterr()
+    printed = capfd.readouterr()
     assert code in (0, 1)
-    assert "damaged stretches in the file" in said.out
-    assert not said.err
+    assert "damaged stretches in the file" in printed.out
+    assert not printed.err
 
 
 @mark.parametrize(
@@ -233,5 +233,5 @@ def test_sizes_that_only_another_unit_gives(name, size, factor, words):
 @mark.slow
 @mark.parametrize("name", list(FORMATS))
 def test_many_damaged_files(name, tmp_path):
-    said = all_of(name, tmp_path, MANY)
-    assert not all(said)
+    readable = all_of(name, tmp_path, MANY)
+    assert not all(readable)

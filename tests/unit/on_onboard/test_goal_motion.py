@@ -78,11 +78,11 @@ def test_a_located_state_layout_has_the_mean_goal():
     assert layout.dimension == ob.layout_of(params).dimension + 2
     rng = default_rng(1)
     places = 0.1 * rng.standard_normal((10, 2))
-    seen = [1.5, -0.5] + 0.05 * rng.standard_normal((10, 2))
+    goals = [1.5, -0.5] + 0.05 * rng.standard_normal((10, 2))
     frames = torch.zeros(10, 1, layout.frame)
     frames[:, 0, :2] = torch.tensor(places)
-    frames[:, 0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(seen - places)
+    frames[:, 0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(goals - places)
     for step, found in enumerate(followed(layout, frames, None, None)):
         assert torch.equal(found.frame, frames[step])
-        wanted = np.mean(seen[: step + 1], axis=0) - places[step]
-        assert_allclose(found.places[0].numpy(), wanted, atol=1e-5)
+        expected = np.mean(goals[: step + 1], axis=0) - places[step]
+        assert_allclose(found.places[0].numpy(), expected, atol=1e-5)

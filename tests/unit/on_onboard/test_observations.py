@@ -36,11 +36,11 @@ def test_the_papers_state_is_assembled_in_its_order():
     history = torch.arange(200.0, 200 + 3 * (1 + layout.history)).reshape(1, -1, 3)
     old = history.flatten().tolist()
     for fresh in (False, True):
-        seen, after = ob.observe(
+        observation, after = ob.observe(
             layout, frame, None, previous, torch.tensor([1.0]), history, torch.tensor([fresh])
         )
         now = [102.0, 103.0, 104.0]
         past = now * layout.history if fresh else old[: 3 * layout.history]
-        assert seen.tolist() == [[*VEHICLE, 60, 61, 62, 63, 64, 100, 101, *now, *past, 1.0]]
+        assert observation.tolist() == [[*VEHICLE, 60, 61, 62, 63, 64, 100, 101, *now, *past, 1.0]]
         assert after.flatten().tolist() == [*now, *past]
     assert layout.dimension == 35

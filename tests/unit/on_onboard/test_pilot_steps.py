@@ -17,7 +17,7 @@ LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 STILL, GOAL = np.zeros((1, 3)), np.array([2.0, 0.0, 0.0])
 
 
-def seen(pilot: Pilot, time: float, now: float | None):
+def observe(pilot: Pilot, time: float, now: float | None):
     """Observation of a payload that moves evenly."""
     payload = np.array([[0.1 + 0.9 * time, -0.4 * time, -0.38 + 0.2 * time]])
     speed = np.array([[1.5 * time, -time, 0.3]])
@@ -40,7 +40,7 @@ def responsive():
 def flown(times, timed=True, policy=None):
     """Observations of a pilot whose steps come at some times [periods]."""
     pilot = Pilot(policy or simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0)))
-    return [seen(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
+    return [observe(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
 
 
 @mark.parametrize(
@@ -81,10 +81,10 @@ def test_what_is_older_than_the_throw_is_its_first_step():
 def test_a_release_that_was_not_done_is_not_reported():
     pilot = Pilot(simple_policy((-0.1, 0.3, 0.0, 0.0, 1.0)))
     before = pilot.previous_action[0, 4]
-    seen(pilot, 0.0, 0.0)
+    observe(pilot, 0.0, 0.0)
     assert pilot.previous_action[0, 4] == 1.0
     pilot.cancel_release()
     assert pilot.previous_action[0].tolist() == approx([-0.1, 0.3, 0.0, 0.0, before])
-    seen(pilot, PERIOD, PERIOD)
+    observe(pilot, PERIOD, PERIOD)
     pilot.cancel_release()
     assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"

@@ -115,7 +115,7 @@ def rewritten(path, change):
 
 
 @mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             lambda a, h: h.update(format_version=FORMAT_VERSIONS[-1] + 1),
@@ -139,13 +139,13 @@ def rewritten(path, change):
         ),
     ],
 )
-def test_incomplete_or_contradictory_files_are_refused(policy, tmp_path, change, said):
+def test_incomplete_or_contradictory_files_are_refused(policy, tmp_path, change, message):
     path = tmp_path / "p.npz"
     policy.save(path)
     rewritten(path, change)
     with raises(PolicyError) as caught:
         Policy.load(path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "p.npz" in str(caught.value)
 
 

@@ -48,10 +48,10 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
     views = [value.astype(np.float32) for value in (pos, quat, goal, payload)]
     pos, quat, goal, payload = map(torch.from_numpy, views)
     points, valid = keypoints(camera, pos, rotation_from_quat(quat), goal, payload)
-    seen = []
+    rows = []
     for k in range(count):
         pos, quat, goal, payload = (value[k : k + 1] for value in views)
-        seen.append(row_keypoints(arrays, pos, rotation_from_quat(quat), goal, payload))
-    assert_array_equal(np.concatenate([seen_valid for _, seen_valid in seen]), valid)
-    assert_allclose(np.concatenate([place for place, _ in seen]), points, rtol=0.0, atol=SINGLE)
+        rows.append(row_keypoints(arrays, pos, rotation_from_quat(quat), goal, payload))
+    assert_array_equal(np.concatenate([row_valid for _, row_valid in rows]), valid)
+    assert_allclose(np.concatenate([place for place, _ in rows]), points, rtol=0.0, atol=SINGLE)
     assert 0.1 < valid.float().mean() < 0.9, "points inside and outside of the field of view"

@@ -9,7 +9,7 @@ from pytest import mark
 from visthrow.onboard.pilot import Pilot
 from visthrow.throws.loading import load_policy
 
-SEEN = ("goal", "payload", "validity")
+GROUPS = ("goal", "payload", "validity")
 STEPS = 12
 
 
@@ -46,7 +46,7 @@ def changed(name):
 @mark.parametrize("name", ["vision", "vision_betaflight"])
 def test_nothing_but_keypoints_tells_of_goal_and_payload(name):
     columns, layout = changed(name)
-    assert columns == set(layout.columns(*SEEN))
+    assert columns == set(layout.columns(*GROUPS))
     assert not layout.fits
 
 
@@ -54,7 +54,7 @@ def test_what_an_estimator_adds_is_found():
     """The check is not vacuous: of a located layout more columns differ."""
     columns, layout = changed("vision_located")
     assert columns & set(layout.columns("located"))
-    assert columns <= set(layout.columns(*SEEN, "located"))
+    assert columns <= set(layout.columns(*GROUPS, "located"))
 
 
 def test_validity_bits_are_the_cameras():

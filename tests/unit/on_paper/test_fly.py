@@ -25,7 +25,7 @@ from visthrow.throws import results
 
 importorskip("piqp")
 
-OWN_MODEL = 0.05
+MODEL_ERROR = 0.05
 """Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027.
 """
 
@@ -102,10 +102,10 @@ def test_thrust_stops_at_its_limit(below, limit):
     assert command[0] == approx(limit, abs=1e-3)
 
 
-def test_own_model_throws_land_near_the_target(plan):
+def test_throws_in_the_planners_model_land_near_the_target(plan):
     flown = fly_pendulum(plan, 2)
     assert flown.success.all()
-    assert np.all(flown.error < OWN_MODEL)
+    assert np.all(flown.error < MODEL_ERROR)
     assert np.allclose(flown.duration, plan.duration, atol=0.02)
     again = fly_pendulum(plan, 2)
     assert np.array_equal(flown.landing_w, again.landing_w)
@@ -154,5 +154,5 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, one_start):
 
 
 def test_the_command_refuses_what_it_cannot_fly(tmp_path, refused):
-    refused(f"baseline --plants hybird --out {tmp_path}", said="did you mean 'hybrid'")
-    refused("baseline --throws 0", said="expected 1 or more")
+    refused(f"baseline --plants hybird --out {tmp_path}", message="did you mean 'hybrid'")
+    refused("baseline --throws 0", message="expected 1 or more")

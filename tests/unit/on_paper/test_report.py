@@ -130,9 +130,9 @@ def test_ablation_ratio_bias_and_the_verdict():
     assert rows["no motor lag"][6].startswith("2.4 [")
     assert rows["rigid cable"][11] == "overshoots"
     assert rows["rigid cable"][12] == "undershoots"
-    said = texts(section, "finding")
-    assert re.search(r"no aerodynamics\*\*.*no effect shows; the paper: 3\.26", said)
-    assert re.search(r"no motor lag\*\*.*the component matters; the paper: 2\.42", said)
+    findings = texts(section, "finding")
+    assert re.search(r"no aerodynamics\*\*.*no effect shows; the paper: 3\.26", findings)
+    assert re.search(r"no motor lag\*\*.*the component matters; the paper: 2\.42", findings)
 
 
 def test_the_page_stands_alone(written):
@@ -159,8 +159,8 @@ def test_the_command_reports_from_records(tmp_path, full, refused, printed):
     assert "0 trainings" in text
     assert (out / "report.html").stat().st_size > 50_000
     for option in ("--results", "--records"):
-        refused(f"report {option} {tmp_path}/none --out {tmp_path}/other", said="no such folder")
-        refused(f"report {option} {tmp_path} --out {tmp_path}/other", said="in it; expected")
+        refused(f"report {option} {tmp_path}/none --out {tmp_path}/other", message="no such folder")
+        refused(f"report {option} {tmp_path} --out {tmp_path}/other", message="in it; expected")
         assert not (tmp_path / "other").exists()
 
 

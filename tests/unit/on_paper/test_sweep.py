@@ -109,11 +109,11 @@ def test_departures_are_what_differs_from_the_training(path, tmp_path):
     work = load_list(path)
     source = work.sources[2]
     finish(source, tmp_path)
-    own, transfer = (
+    in_training, transfer = (
         work.throws[source.id][0].unit(tmp_path),
         work.throws[source.id][2].unit(tmp_path),
     )
-    assert own["departures"] == {}
+    assert in_training["departures"] == {}
     assert transfer["departures"] == {"rope.segments": 15}
     assert (transfer["variant"], transfer["run"], transfer["train_seed"]) == (
         "rigid_cable",
@@ -188,9 +188,9 @@ def fast(monkeypatch):
     monkeypatch.setattr(pool, "BUSY_PAUSE", 0.01)
 
 
-def run(path, out, minutes=None, **told):
+def run(path, out, minutes=None, **options):
     work = load_list(path)
-    starter = FakeStarter(work, out, told.pop("devices", ["a", "b"]), 3, **told)
+    starter = FakeStarter(work, out, options.pop("devices", ["a", "b"]), 3, **options)
     return starter, pool.ProcessPool(work, out, starter, lambda text: None).run(minutes)
 
 
@@ -294,8 +294,8 @@ def test_a_folder_in_which_nothing_is_done_makes_no_record(path, tmp_path):
 
 def test_records_join_what_two_machines_did(path, tmp_path):
     work = load_list(path)
-    here, there, records = tmp_path / "here", tmp_path / "there", tmp_path / "records"
-    for out, sources in ((here, work.sources[1:3]), (there, work.sources[3:])):
+    first, second, records = tmp_path / "here", tmp_path / "there", tmp_path / "records"
+    for out, sources in ((first, work.sources[1:3]), (second, work.sources[3:])):
         for source in sources:
             finish(source, out)
             for unit in work.throws[source.id]:
@@ -317,16 +317,16 @@ def test_records_join_what_two_machines_did(path, tmp_path):
     found = results.load(throws)
     assert len(found) == 4 * 4
     before = throws.read_text()
-    collect(work, there, records)
+    collect(work, second, records)
     assert throws.read_text() == before
-    policy = work.sources[3].policy(there)
+    policy = work.sources[3].policy(second)
     policy.write_bytes(
         policy.read_bytes() + b"x"
     )  # trained anew: the old throws are of another policy
     units._hash.cache_clear()
     for unit in work.throws[work.sources[3].id]:
-        throw(unit, there)
-    collect(work, there, records)
+        throw(unit, second)
+    collect(work, second, records)
     again = results.load(throws)
     assert len(again) == 16
     assert {r.unit["weights"] for r in again} != {r.unit["weights"] for r in found}
@@ -337,11 +337,11 @@ def test_status_and_mistakes_on_the_command_line(path, tmp_path, refused, printe
     assert "state_rigid_cable-2" in out
     assert "23 units left" not in out
     assert "22 units left" in out, "4 trainings, 4 x (2 + 2) throws and 2 of the shipped policy"
-    refused("sweep status papre", said="did you mean 'paper'")
-    refused(f"sweep run {path} --minutes 0", said="expected more than 0")
+    refused("sweep status papre", message="did you mean 'paper'")
+    refused(f"sweep run {path} --minutes 0", message="expected more than 0")
     refused(
         f"sweep run {path} --slurm partition=gpu --devices cuda:0 --minutes 9",
-        said="the number of GPUs",
+        message="the number of GPUs",
     )
 
 
@@ -359,9 +359,9 @@ def test_the_status_of_a_sweep_says_how_it_ended(
 ):
     monkeypatch.setattr(pool.ProcessPool, "run", lambda *_: outcome)
     assert run_command(f"sweep run {path} --out {tmp_path} --devices cpu") == status
-    said = capsys.readouterr().err
-    assert ("state-1 failed: out of memory" in said) == bool(outcome.failed)
-    assert ("the same command goes on" in said) == outcome.stopped
+    printed = capsys.readouterr().err
+    assert ("state-1 failed: out of memory" in printed) == bool(outcome.failed)
+    assert ("the same command goes on" in printed) == outcome.stopped
 
 
 @mark.parametrize(
@@ -400,7 +400,7 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused
 
     monkeypatch.setenv("PATH", str(tmp_path))
     command = f"sweep run {path} --out {tmp_path}/out --slurm partition=gpu --devices 2 --minutes 9"
-    refused(command, said="no jobs can be submitted from here")
+    refused(command, message="no jobs can be submitted from here")
     keep = f"/bin/cat $1 >> {tmp_path}/script; echo Submitted batch job 7"
     for name, text in (("srun", ""), ("sbatch", keep)):
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
@@ -408,5 +408,5 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused
     cluster = Cluster(path, tmp_path, "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"})
     cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", math.inf)
     script = (tmp_path / "script").read_text()
-    for wanted in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
-        assert wanted in script
+    for option in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
+        assert option in script

@@ -42,10 +42,10 @@ def test_an_effect_takes_what_others_leave_of_a_number():
     names = "rotor_drag", "rotor_drag_z"
     effects = {name: catalogue()[name].bounded(setting) for name in names}
     drag = setting.plant.vehicle.aero.drag_z
-    asked = {"rotor_drag_z": -0.75 * drag, "rotor_drag": -drag}
+    sizes_together = {"rotor_drag_z": -0.75 * drag, "rotor_drag": -drag}
     with raises(ValueError, match="drag_z is -"):
-        apply(effects, setting, asked)
-    sizes = possible_together(effects, setting, asked)
+        apply(effects, setting, sizes_together)
+    sizes = possible_together(effects, setting, sizes_together)
     assert sizes == {"rotor_drag": -drag, "rotor_drag_z": approx(-0.5 * drag)}
     assert apply(effects, setting, sizes).plant.vehicle.aero.drag_z == approx(0.0, abs=1e-15)
     assert possible_together(effects, setting, {"rotor_drag_z": -drag}) == {"rotor_drag_z": -drag}

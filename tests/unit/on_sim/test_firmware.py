@@ -58,8 +58,8 @@ def test_the_voltage_of_a_hover():
 
 
 def test_what_the_block_has_no_number_for_is_reported():
-    told = missing_features(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
-    assert [text.split()[0] for text in told] == ["tpa_rate", "d_max"]
+    missing = missing_features(SETTINGS | {"tpa_rate": "65", "d_max": "10,12,0"})
+    assert [text.split()[0] for text in missing] == ["tpa_rate", "d_max"]
     assert missing_features(SETTINGS | {"d_max": "0,0,0"}) == []
 
 

@@ -47,7 +47,7 @@ class LaggingPendulum:
             self.state = pm.step(self.model, self.state, self.acts, STEP)
 
     @property
-    def seen(self) -> tuple[np.ndarray, ...]:
+    def measured(self) -> tuple[np.ndarray, ...]:
         """Position, attitude and velocity of the vehicles, shapes (E, 3), (E, 4) and (E, 3)."""
         direction = self.state[:, pm.DIR]
         pos_w = self.state[:, pm.POS] - LENGTH * direction
@@ -65,8 +65,8 @@ def fly(plant: LaggingPendulum, duration: float, yaw: float = 0.0, heavier=1.0, 
     controller = HoverController(HoverParams(**params), PERIOD, len(plant.state))
     rows = []
     for k in range(round(duration / PERIOD)):
-        plant.advance(k * PERIOD, controller.step(*plant.seen, GOAL, heavier * plant.mass, yaw))
-        pos_w = plant.seen[0]
+        plant.advance(k * PERIOD, controller.step(*plant.measured, GOAL, heavier * plant.mass, yaw))
+        pos_w = plant.measured[0]
         rows.append((norm(pos_w - GOAL, axis=1), plant.swing, pos_w[:, 2]))
     return (PERIOD * np.arange(1, len(rows) + 1), *map(np.array, zip(*rows)))
 
@@ -107,7 +107,7 @@ def test_hover_without_the_payload_and_yaw_turns():
     plant = LaggingPendulum(GOAL + [[0.4, -0.3, 0.0]], payload=NOTHING)
     times, distances, _, _ = fly(plant, 6.0, yaw=2.0)
     assert settled(times, distances[:, 0], 0.03) < 3.5
-    rot_wb = matrix_of_quat(plant.seen[1])[0]
+    rot_wb = matrix_of_quat(plant.measured[1])[0]
     assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == approx(2.0, abs=0.02)
 
 
@@ -134,8 +134,8 @@ def test_far_goals_are_approached_at_the_speed_limit():
     plant = LaggingPendulum(GOAL - [[10.0, 0, 0]])
     controller = HoverController(params, PERIOD)
     for k in range(150):
-        plant.advance(k * PERIOD, controller.step(*plant.seen, GOAL, plant.mass))
-    assert plant.seen[2][0, 0] == approx(params.max_speed, rel=0.05)
+        plant.advance(k * PERIOD, controller.step(*plant.measured, GOAL, plant.mass))
+    assert plant.measured[2][0, 0] == approx(params.max_speed, rel=0.05)
 
 
 def test_commands_by_hand():

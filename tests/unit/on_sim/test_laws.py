@@ -167,14 +167,14 @@ def test_laws_are_part_of_the_configuration():
 
 
 @mark.parametrize(
-    ("law", "said"),
+    ("law", "message"),
     [
         ("factors = ['sped'], vector = 'vel'", "no factor 'sped'; did you mean 'speed'? Known: th"),
         ("factors = [], vector = 'joint_rate'", "no vector 'joint_rate'; Known: body_z, body_x"),
         ("factors = ['speed', 'rate', 'speed'], vector = 'vel'", "3 factors; expected at most 2"),
     ],
 )
-def test_a_law_that_is_none_is_refused_where_it_is_read(tmp_path, law, said):
+def test_a_law_that_is_none_is_refused_where_it_is_read(tmp_path, law, message):
     """The message names the file and the number of the law in it."""
     right = "{block = 'vehicle force', factors = ['speed'], vector = 'vel', coefficient = -0.01}"
     wrong = f"{{block = 'vehicle force', {law}, coefficient = 1}}"
@@ -183,7 +183,7 @@ def test_a_law_that_is_none_is_refused_where_it_is_read(tmp_path, law, said):
     with raises(ConfigError) as error:
         config.load(Experiment, path)
     assert "mine.toml: laws[1]: law on vehicle force: " in str(error.value)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 def test_laws_that_no_simulation_makes_are_refused():

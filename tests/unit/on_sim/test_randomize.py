@@ -119,9 +119,9 @@ def test_cable_rates_come_on_top_of_the_bodys():
     by_tilt = np.cross(axis, down)
     tilt_rate = np.sum(swing * by_tilt, -1)  # unit vectors, perpendicular to each other's
     assert_uniform(np.degrees(tilt_rate), -bound, bound)
-    seen = np.abs(tilt) > 0.05
+    tilted = np.abs(tilt) > 0.05
     azimuth_rate = np.sum(swing * by_azimuth, -1) / np.maximum(np.sum(by_azimuth**2, -1), 1e-12)
-    assert_uniform(np.degrees(azimuth_rate[seen]), -bound, bound)
+    assert_uniform(np.degrees(azimuth_rate[tilted]), -bound, bound)
 
 
 def test_every_segment_starts_alike():
@@ -162,8 +162,8 @@ def test_draws_are_independent():
 def test_every_reset_draws_anew():
     plant = paper_plant()
     sim = HybridSim(plant, 4, seed=1)
-    seen = []
+    positions = []
     for _ in range(5):
         sim.randomize(spreads())
-        seen.append(sim.get("pos_w"))
-    assert len(np.unique(np.array(seen)[..., 0])) == 20
+        positions.append(sim.get("pos_w"))
+    assert len(np.unique(np.array(positions)[..., 0])) == 20

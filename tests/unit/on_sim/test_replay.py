@@ -36,28 +36,28 @@ def flight():
     sim = HybridSim(plant(), 1, extensions=EVERYTHING)
     tilt = np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
     sim.place(pos_w=np.array([[0.0, 0.0, 1.5]]), cable_dir_w=np.tile(tilt, (1, 15, 1)))
-    own = [name for name in rk.STATE_FIELDS if not name.startswith(("payload", "slack"))]
-    start = {name: sim.get(name) for name in own} | {"payload_pos_w": sim.get("payload_pos_w")}
+    fields = [name for name in rk.STATE_FIELDS if not name.startswith(("payload", "slack"))]
+    start = {name: sim.get(name) for name in fields} | {"payload_pos_w": sim.get("payload_pos_w")}
     start |= {
         "payload_vel_w": sim.get("payload_vel_w"),
         "slack_first": np.zeros(1),
         "slack_last": np.zeros(1),
     }
     times, commands = [-1.0], [sim.get("queue")[0, 0]]
-    seen = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "rate_b")}
+    recorded = {name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "rate_b")}
     for k in range(PERIODS):
         times.append(0.02 * k)
         thrust = 2.6 * (1 + 0.2 * np.sin(0.4 * k))
         commands.append(np.array([thrust, 1.5 * np.sin(0.3 * k), 1.5 * np.cos(0.2 * k), 0.3]))
         sim.set_command(commands[-1][None], one(k == RELEASED_AT))
         sim.step()
-        for name, values in seen.items():
+        for name, values in recorded.items():
             values.append(sim.get(name)[0].copy())
     return (
         start,
         np.array(times),
         np.array(commands),
-        {name: np.array(values) for name, values in seen.items()},
+        {name: np.array(values) for name, values in recorded.items()},
     )
 
 
@@ -65,10 +65,10 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
     """Replay the flight in some lanes; returns the vectors seen by group, each (stamps, lanes, 3),
     and all there is.
     """
-    start, times, commands, seen = flight
+    start, times, commands, recorded = flight
     stamps = 0.02 * (1 + np.arange(PERIODS)) if stamps is None else stamps
     hanging = stamps <= 0.02 * RELEASED_AT + 0.1
-    quats = seen["quat_wb"][np.clip(np.round(stamps / 0.02).astype(int) - 1, 0, PERIODS - 1)]
+    quats = recorded["quat_wb"][np.clip(np.round(stamps / 0.02).astype(int) - 1, 0, PERIODS - 1)]
     data = {
         "command_time": times,
         "command": commands,
@@ -125,15 +125,15 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
 
 
 def test_replay_is_the_simulator(flight):
-    seen, _ = replay(flight, [plant()])
+    replayed, _ = replay(flight, [plant()])
     truth = flight[3]
-    assert np.abs(seen["pos"][:, 0] - truth["pos_w"]).max() < ROUNDING
-    assert np.abs(seen["turn"]).max() < ROUNDING
+    assert np.abs(replayed["pos"][:, 0] - truth["pos_w"]).max() < ROUNDING
+    assert np.abs(replayed["turn"]).max() < ROUNDING
     assert (
-        np.abs(seen["payload"][:, 0] - truth["payload_pos_w"][: len(seen["payload"])]).max()
+        np.abs(replayed["payload"][:, 0] - truth["payload_pos_w"][: len(replayed["payload"])]).max()
         < ROUNDING
     )
-    assert np.abs(seen["rate"][:, 0] - truth["rate_b"]).max() < 1e3 * ROUNDING
+    assert np.abs(replayed["rate"][:, 0] - truth["rate_b"]).max() < 1e3 * ROUNDING
     assert all(len(build.replay.module.execs) == 1 for build in _BUILDS.values()), "compiled once"
 
 
@@ -143,8 +143,8 @@ def test_commands_switch_where_they_should(flight):
     """
     late = [0.0, 2e-4, 2e-3]
     plants = [changed(plant(), {"vehicle.queue.delay": 0.022 + x}) for x in late]
-    seen, _ = replay(flight, plants, count=3, plant=np.arange(3))
-    small, large = ((seen["pos"][:, i] - seen["pos"][:, 0]) / late[i] for i in (1, 2))
+    replayed, _ = replay(flight, plants, count=3, plant=np.arange(3))
+    small, large = ((replayed["pos"][:, i] - replayed["pos"][:, 0]) / late[i] for i in (1, 2))
     assert np.abs(large - small).max() < 0.05 * np.abs(large).max()
 
 
@@ -152,14 +152,14 @@ def test_a_command_that_does_not_come_leaves_the_one_before(flight):
     """A lane that skips a command flies as though the log held the one before in its place."""
     start, times, commands, truth = flight
     skipped = np.array([5, 12])
-    seen, _ = replay(flight, [plant()], count=2, skip=skipped)
+    replayed, _ = replay(flight, [plant()], count=2, skip=skipped)
     for lane, number in enumerate(skipped):
         held = commands.copy()
         held[number] = held[number - 1]
         assert norm(held - commands) > 0.01
         expected, _ = replay((start, times, held, truth), [plant()])
         for name, values in expected.items():
-            assert_array_equal(seen[name][:, lane], values[:, 0])
+            assert_array_equal(replayed[name][:, lane], values[:, 0])
 
 
 def test_release_falls_between_steps(flight):
@@ -177,10 +177,10 @@ def test_release_falls_between_steps(flight):
 def test_lanes_do_not_see_each_other(flight):
     heavy = changed(plant(), {"rope.payload_mass": 0.08})
     rows = np.array([0, 1, 0, 1, 1, 0, 0])
-    seen, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
+    replayed, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
     alone = [replay(flight, [x])[0]["pos"][:, 0] for x in (plant(), heavy)]
     for i, row in enumerate(rows):
-        assert_array_equal(seen["pos"][:, i], alone[row])
+        assert_array_equal(replayed["pos"][:, i], alone[row])
     assert np.abs(alone[0] - alone[1]).max() > 1e-3
 
 
@@ -189,7 +189,7 @@ def test_latent_forces_push(flight):
     force = 0.01
     mass = plant().vehicle.body.mass
     knots = np.arange(9)
-    seen, _ = replay(
+    replayed, _ = replay(
         flight,
         [plant()],
         count=10,
@@ -197,7 +197,7 @@ def test_latent_forces_push(flight):
         knot=np.append(knots, 0),
         size=np.append(np.full(9, force), 0.0),
     )
-    pushed = np.sum(seen["pos"][:, :9] - seen["pos"][:, 9:], axis=1)
+    pushed = np.sum(replayed["pos"][:, :9] - replayed["pos"][:, 9:], axis=1)
     early = 0.02 * (1 + np.arange(PERIODS)) < 0.12  # before the rope answers
     time = 0.02 * (1 + np.arange(PERIODS))[early]
     hanging = plant().rope.payload_mass + plant().rope.rope_mass
@@ -217,21 +217,21 @@ def test_sensors(flight):
         gyro_bias=(0.1, 0.2, 0.3),
     )
     stamps = 0.02 * (2 + np.arange(PERIODS - 4))
-    seen, _ = replay(flight, [plant()], [x], stamps=stamps)
+    replayed, _ = replay(flight, [plant()], [x], stamps=stamps)
     vehicle, payload, gyro = (
         replay(flight, [plant()], stamps=stamps - late)[0] for late in (0.003, 0.004, 0.0)
     )
     measured = Rotation.from_quat(flight[3]["quat_wb"][1 : 1 + len(stamps)])
     attitude = measured * Rotation.from_rotvec(vehicle["turn"][:, 0])
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
-    wanted = 1.01 * frame.apply(vehicle["pos"][:, 0] + attitude.apply(x.marker_offset))
-    assert_allclose(seen["pos"][:, 0], wanted, atol=1e-9)
+    expected = 1.01 * frame.apply(vehicle["pos"][:, 0] + attitude.apply(x.marker_offset))
+    assert_allclose(replayed["pos"][:, 0], expected, atol=1e-9)
     turn = (measured.inv() * frame * attitude * marker).as_rotvec()
-    assert_allclose(seen["turn"][:, 0], turn, atol=1e-9)
-    hanging = payload["payload"][: len(seen["payload"]), 0]
-    wanted = 1.01 * frame.apply(hanging + x.payload_offset)
-    assert_allclose(seen["payload"][:, 0], wanted, atol=1e-9)
-    turning = seen["rate"][:, 0] - gyro["rate"][:, 0]
+    assert_allclose(replayed["turn"][:, 0], turn, atol=1e-9)
+    hanging = payload["payload"][: len(replayed["payload"]), 0]
+    expected = 1.01 * frame.apply(hanging + x.payload_offset)
+    assert_allclose(replayed["payload"][:, 0], expected, atol=1e-9)
+    turning = replayed["rate"][:, 0] - gyro["rate"][:, 0]
     assert_allclose(turning, np.tile(x.gyro_bias, (len(stamps), 1)), atol=1e-9)
 
 

@@ -114,7 +114,7 @@ def test_the_note_does_not_contradict_the_title():
 
 
 def test_what_holds_no_throws(tmp_path, refused):
-    refused(f"compare --from {tmp_path}/none", said="no such folder")
+    refused(f"compare --from {tmp_path}/none", message="no such folder")
     (tmp_path / "summary.json").write_text("{}")
     with raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
         from_runs.logs_of([tmp_path])
@@ -124,4 +124,4 @@ def test_what_holds_no_throws(tmp_path, refused):
     bare = FlightLog({}, {"policy": "x"})
     with raises(LogError, match="holds no throw of a run"):
         from_runs.entries([bare])
-    refused(f"compare vision --from {tmp_path}", said="the runs say which policies")
+    refused(f"compare vision --from {tmp_path}", message="the runs say which policies")

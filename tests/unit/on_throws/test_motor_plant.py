@@ -74,10 +74,10 @@ def test_rotors_turn_the_body_about_the_right_axis(plant, more, axis, sign):
 def test_the_ball_separates_the_mechanisms_lag_after_the_latch(plant):
     hover = command_for(plant, 1.02 * plant.mass[0] * GRAVITY)
     fly(plant, hover, 0.4)
-    asked = plant.time
+    latch_time = plant.time
     for _ in range(60):
         plant.step(np.full(4, hover), True)
-    assert plant.landing["separation_time"] - asked == approx(0.06, abs=1e-6)
+    assert plant.landing["separation_time"] - latch_time == approx(0.06, abs=1e-6)
 
 
 def test_it_stands_on_the_ground_it_came_down_to_and_takes_off_again(plant):

@@ -155,17 +155,17 @@ def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     experiment = load_experiment("state")
     plant = make_plant("hybrid", experiment, 400)
-    truth, seen = (
+    truth, measured = (
         plant.state,
         plant.measured(),
     )  # right after a reset nothing has moved yet, so nothing is late
     for name in MEASURED_VECTORS:
-        spread = (getattr(seen, name) - getattr(truth, name)).std()
+        spread = (getattr(measured, name) - getattr(truth, name)).std()
         assert spread == approx(experiment.task.noise.observation_step, rel=0.1)
-    errors = [(getattr(seen, name) - getattr(truth, name)).ravel() for name in MEASURED_VECTORS]
+    errors = [(getattr(measured, name) - getattr(truth, name)).ravel() for name in MEASURED_VECTORS]
     assert_allclose(np.corrcoef(errors), np.eye(4), atol=0.15)
-    assert_allclose(norm(seen.quat_wb, axis=1), 1.0)
-    angle = 2.0 * norm(seen.quat_wb[:, :3], axis=1)
+    assert_allclose(norm(measured.quat_wb, axis=1), 1.0)
+    angle = 2.0 * norm(measured.quat_wb[:, :3], axis=1)
     assert angle.mean() == approx(
         1.6 * 0.01, rel=0.1
     )  # mean length of three normal deviates: 1.596
@@ -179,10 +179,10 @@ def test_measurements_of_the_hybrid_plant_are_late():
     for _ in range(5):
         before = plant.state
         plant.step(np.tile([8.0, 2.0, 0.0, 0.0], (2, 1)))
-    now, seen = plant.state, plant.measured()
+    now, measured = plant.state, plant.measured()
     for name in MEASURED_VECTORS:
         middle = 0.5 * (getattr(before, name) + getattr(now, name))
-        assert_allclose(getattr(seen, name), middle, atol=1e-12)
+        assert_allclose(getattr(measured, name), middle, atol=1e-12)
     assert_array_equal(
         HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w
     )
@@ -247,45 +247,45 @@ def test_fly_writes_its_files(dropper, tmp_path, printed):
     out = tmp_path / "out"
     command = f"fly --policy {dropper} --target 0.5 0.3 --seed 4 --out {out} --json {out}/r.json"
     saved = f"--save {tmp_path}/saved.npz --export {tmp_path}/flight.csv"
-    told = printed(f"{command} {saved}")
-    assert "landing at x" in told
+    output = printed(f"{command} {saved}")
+    assert "landing at x" in output
     assert {p.name for p in out.iterdir()} == {"flight.npz", "throw.rrd", "throw.png", "r.json"}
     figures = json.loads((out / "r.json").read_text())
     result = figures["result"]
     assert (figures["goal_w"], figures["seed"]) == ([0.5, 0.3, 0.0], 4)
     assert load_policy(tmp_path / "saved.npz").policy.obs_dim == load_policy(dropper).policy.obs_dim
     assert "pos_w" in (tmp_path / "flight.csv").read_text().splitlines()[0]
-    assert f"{result['error']:.3f} m from the target" in told
+    assert f"{result['error']:.3f} m from the target" in output
     verified = run_python("-m", "rerun", "rrd", "verify", out / "throw.rrd")
     assert verified.returncode == 0, verified.stderr
 
 
 def test_compare_flies_the_state_and_the_vision_policy_unless_others_are_named(monkeypatch):
-    asked = []
+    loaded = []
 
     def load(name, *args):
-        asked.append(name)
+        loaded.append(name)
         if name != "state":
             raise ConfigError("enough")
 
     monkeypatch.setattr("visthrow.throws.loading.load_policy", load)
     assert run_command("compare") == run_command("compare vision_located") == 2
-    assert asked == ["state", "vision", "vision_located"]
+    assert loaded == ["state", "vision", "vision_located"]
 
 
 def test_compare_prints_and_writes(dropper, tmp_path, printed):
     out = tmp_path / "out"
     command = f"compare {dropper} --targets 0.5 1.0 --throws 5 --out {out} --json {out}/c.json"
-    told = printed(f"{command} --device cpu --seed 3")
-    assert "`hybrid`, seed 3" in told
-    assert "No vehicle was flown" in told
+    output = printed(f"{command} --device cpu --seed 3")
+    assert "`hybrid`, seed 3" in output
+    assert "No vehicle was flown" in output
     rows = list(csv.DictReader((out / "compare-hybrid.csv").open()))
     assert len(rows) == 10
     assert {row["plant"] for row in rows} == {"hybrid"}
     first = [float(row["landing error [m]"]) for row in rows[:5]]
     summary = json.loads((out / "c.json").read_text())["rows"][0]
     assert summary["error_mean"] == approx(np.mean(first), rel=1e-4)
-    assert f"{summary['error_mean']:.3f} ± {summary['error_std']:.3f}" in told
+    assert f"{summary['error_mean']:.3f} ± {summary['error_std']:.3f}" in output
     assert (out / "compare-hybrid.png").read_bytes()[:4] == b"\x89PNG"
 
 
@@ -302,7 +302,7 @@ def test_compare_throws_under_the_conditions_of_its_options(
     monkeypatch.setattr("visthrow.cli.compare.throw_hybrid", throw)
     options = f"--targets 0.5 1 --throws 7 --seed 3 --device cpu --calibrate --out {tmp_path}"
     refused(
-        f"compare {dropper} {dropper} {options}", said="thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)"
+        f"compare {dropper} {dropper} {options}", message="thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)"
     )
 
 
@@ -337,10 +337,10 @@ def test_demo_without_mujoco(tmp_path, monkeypatch, printed):
         "importlib.util.find_spec",
         lambda name, *parent: None if name == "mujoco" else find(name, *parent),
     )
-    told = printed(f"demo --throws 3 --out {tmp_path}/out")
-    assert "needs MuJoCo" in told
+    output = printed(f"demo --throws 3 --out {tmp_path}/out")
+    assert "needs MuJoCo" in output
     listed = [
-        line.strip() for line in told.partition("Files:")[2].splitlines() if line.startswith("  ")
+        line.strip() for line in output.partition("Files:")[2].splitlines() if line.startswith("  ")
     ]
     assert sorted(listed) == sorted(str(path) for path in (tmp_path / "out").iterdir())
     assert len(listed) == 6
@@ -422,7 +422,7 @@ def test_table_says_success_rate_and_leaves_failures_blank():
     ],
 )
 def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, refused):
-    refused(f"{words.replace('DROPPER', str(dropper))} --out {tmp_path}/out", said=message)
+    refused(f"{words.replace('DROPPER', str(dropper))} --out {tmp_path}/out", message=message)
     assert not (tmp_path / "out").exists()
 
 
@@ -432,7 +432,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
 ):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr("sim.hybrid.HybridSim.step", None)  # nothing may fly
-    refused(f"{command} {dropper} --out {tmp_path}/file/out", said="cannot make the folder")
+    refused(f"{command} {dropper} --out {tmp_path}/file/out", message="cannot make the folder")
 
 
 def test_a_policy_without_its_config_asks_for_one(tmp_path):

@@ -20,4 +20,4 @@ def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
 
 
 def test_it_takes_no_option_of_a_throw(tmp_path, refused):
-    refused(f"fly --no-rope --save {tmp_path}/a.npz --out {tmp_path}", said="--no-rope")
+    refused(f"fly --no-rope --save {tmp_path}/a.npz --out {tmp_path}", message="--no-rope")

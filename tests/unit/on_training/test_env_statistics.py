@@ -76,12 +76,12 @@ def test_flown_commands_have_the_configured_noise_and_bias():
     env = env_of(f"task.noise.command_step={step}", f"task.noise.command_bias={bias}")
     action = torch.zeros(COUNT, act.ACTIONS)
     action[:, 4] = -1.0
-    wanted = act.command_from_action(action[:, :4], 14.0, torch.tensor([10.0, 10.0, 4.0]))
+    exact = act.command_from_action(action[:, :4], 14.0, torch.tensor([10.0, 10.0, 4.0]))
     scale = torch.tensor([7.0, 10.0, 10.0, 4.0])
     errors = []
     for _ in range(4):
         env.carry(action)
-        errors.append((env.views.command.clone() - wanted) / scale)
+        errors.append((env.views.command.clone() - exact) / scale)
     require_spread(torch.stack(errors), step, bias)
 
 

@@ -150,13 +150,13 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, yaw, monkeyp
     def fly(pushes):
         fo.env.load_state_dict(start)
 
-        def forward(k, seen, flying):
-            return fo.layers.action[k].copy_(decided(fo, seen) + pushes[k])
+        def forward(k, observation, flying):
+            return fo.layers.action[k].copy_(decided(fo, observation) + pushes[k])
 
         monkeypatch.setattr(fo.layers, "forward", forward)
         fo.rollout()
-        seen = fo.env.get_observations()["actor"].clone()
-        return {name: fo.flights.x[name][-1].clone() for name in STATES} | {"seen": seen}
+        actor = fo.env.get_observations()["actor"].clone()
+        return {name: fo.flights.x[name][-1].clone() for name in STATES} | {"seen": actor}
 
     end = fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()

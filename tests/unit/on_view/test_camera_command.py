@@ -36,15 +36,15 @@ def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, board, re
     text = Path(right).read_text()
     (tmp_path / "wrong.toml").write_text(text.replace("fx = 96.0", "fx = 99.0"))
     assert "does NOT fit" in printed(f"camera check {tmp_path}/wrong.toml", *board, status=1)
-    refused("camera check fisheye", *board, said="320 x 320 px came; expected 640 x 640")
+    refused("camera check fisheye", *board, message="320 x 320 px came; expected 640 x 640")
 
 
 def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, board, printed):
     out, frame = tmp_path / "seen.png", f"{board[0]}/0.png"
     command = f"camera show {calibrate(tmp_path)} {frame} --straight 100 --out {out}"
-    said = printed(command, *board[1:])
-    assert "4 of 4 keypoints of the goal, 4 of 4 of the payload" in said
-    assert float(said.split("(blue): ")[1].split()[0]) < 0.2
+    output = printed(command, *board[1:])
+    assert "4 of 4 keypoints of the goal, 4 of 4 of the payload" in output
+    assert float(output.split("(blue): ")[1].split()[0]) < 0.2
     before, after = cv2.imread(frame), cv2.imread(str(out))
     coloured = np.ptp(after.astype(int), axis=-1) > 60
     assert coloured.sum() > 35 * 8, (
@@ -57,7 +57,7 @@ def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, board, print
 def test_a_payload_below_the_ground_is_not_drawn(tmp_path, refused):
     refused(
         f"camera show fisheye --hangs 1.4 --out {tmp_path}/a.png",
-        said="--hangs 1.4 below --height 1.333; expected a payload above the ground",
+        message="--hangs 1.4 below --height 1.333; expected a payload above the ground",
     )
     assert not (tmp_path / "a.png").exists()
 

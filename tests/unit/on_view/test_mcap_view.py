@@ -82,19 +82,19 @@ def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, refu
     assert (flown / "flight.parquet").stat().st_size > 0
     refused(
         f"fly --out {tmp_path} --export flight.xyz",
-        said="'.xyz'; expected one of .csv, .parquet, .mcap",
+        message="'.xyz'; expected one of .csv, .parquet, .mcap",
     )
 
 
 def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, refused):
     refused(
         f"fly --out {tmp_path} --set task.noise.command_step=0",
-        said="fly sends commands as they are",
+        message="fly sends commands as they are",
     )
 
 
 def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     folder = tmp_path / "flown"
-    refused(f"fly --out {folder} --export {tmp_path}/flight.mcap", said="visthrow[recordings]")
+    refused(f"fly --out {folder} --export {tmp_path}/flight.mcap", message="visthrow[recordings]")
     assert not folder.exists()

@@ -135,7 +135,7 @@ def test_a_reader_that_goes_away_is_no_failure():
 
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(command, tmp_path, refused):
     command(KeyboardInterrupt())
-    refused(f"try --json {tmp_path}", said="it is a folder")
+    refused(f"try --json {tmp_path}", message="it is a folder")
 
 
 def test_a_missing_optional_package_names_the_extra(command, capsys):
@@ -168,7 +168,7 @@ def test_config_prints_what_loads_back(tmp_path, printed):
 
 
 @mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("config vehicel", "did you mean 'vehicle'"),
         ("config vehicle papr", "did you mean 'paper'"),
@@ -182,14 +182,14 @@ def test_config_prints_what_loads_back(tmp_path, printed):
         ("sweep status trial --out deep.toml", "deep.toml is a file; expected a"),
     ],
 )
-def test_config_mistakes(arguments, said, refused, tmp_path, monkeypatch):
+def test_config_mistakes(arguments, message, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("deep.toml").write_text(f"a = {'[' * 3000}{']' * 3000}")
-    refused(arguments, said=said)
+    refused(arguments, message=message)
 
 
 @mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (
             "camera show fisheye --target nan 0",
@@ -213,10 +213,10 @@ def test_config_mistakes(arguments, said, refused, tmp_path, monkeypatch):
         ),
     ],
 )
-def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, capsys):
+def test_numbers_that_mean_nothing_are_refused_before_the_work(words, message, capsys):
     with raises(SystemExit, match="2"):
         run_command(words)
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_file_of_windows_notepad_is_read(tmp_path):

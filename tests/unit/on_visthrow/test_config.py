@@ -64,7 +64,7 @@ def test_values_arrive_with_their_types(write):
 
 
 @mark.parametrize(
-    ("change", "said"),
+    ("change", "parts"),
     [
         (("count = 3", "count = 3.0"), ["count", "3.0 (float)", "a whole number"]),
         (("count = 3", "count = true"), ["count", "True (bool)", "a whole number"]),
@@ -89,11 +89,11 @@ def test_values_arrive_with_their_types(write):
         (("count = 3", "count ="), ["no valid TOML"]),
     ],
 )
-def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, said):
+def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, parts):
     path = write("a.toml", GOOD.replace(*change))
     with raises(ConfigError) as caught:
         config.load(Outer, path)
-    for part in ["a.toml", *said]:
+    for part in ["a.toml", *parts]:
         assert part in str(caught.value)
 
 
@@ -174,7 +174,7 @@ def test_a_table_among_like_ones_lies_on_top_of_its_base():
 
 
 @mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (
             "[rows.x]\na = 1\nb = [1, 2]\n[rows.y]\nbase = 'z'",
@@ -191,10 +191,10 @@ def test_a_table_among_like_ones_lies_on_top_of_its_base():
         ),
     ],
 )
-def test_a_wrong_base_of_a_table_is_refused(text, said):
+def test_a_wrong_base_of_a_table_is_refused(text, message):
     with raises(ConfigError) as caught:
         config.loads(Rows, text)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_circles_are_refused(write):
@@ -226,7 +226,7 @@ def test_overrides_apply_in_order_after_includes(write):
 
 
 @mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("inner.gian=[1,2]", "did you mean 'gain'"),
         ("innr.gain=[1,2]", "did you mean 'inner'"),
@@ -238,11 +238,11 @@ def test_overrides_apply_in_order_after_includes(write):
         ("inner=nowhere.toml", "no file 'nowhere.toml'"),
     ],
 )
-def test_bad_overrides_name_themselves_and_what_exists(write, override, said):
+def test_bad_overrides_name_themselves_and_what_exists(write, override, message):
     with raises(ConfigError) as caught:
         config.load(Outer, write("a.toml", GOOD), [override])
     assert f"override '{override}'" in str(caught.value)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_dumps_loads_back_equal(write):

@@ -81,7 +81,7 @@ from visthrow.training.trainer import fitted
     ],
 )
 def test_the_command_refuses(kind, name, change, message, refused):
-    refused(f"config {kind} {name} --set {change}", said=message)
+    refused(f"config {kind} {name} --set {change}", message=message)
 
 
 def test_the_thrust_of_an_action_is_the_vehicles_unless_it_is_set():

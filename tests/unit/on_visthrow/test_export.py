@@ -85,7 +85,7 @@ def test_the_command_writes_by_the_ending_and_refuses_others(tmp_path, capsys, r
     assert "35 observations, 5 actions" in capsys.readouterr().out
     refused(
         f"policy export state --out {tmp_path}/p.tflite",
-        said="expected a name that ends in .onnx or .c",
+        message="expected a name that ends in .onnx or .c",
     )
     assert not (tmp_path / "p.tflite").exists()
 

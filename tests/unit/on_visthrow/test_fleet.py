@@ -38,8 +38,8 @@ def experiment(*overrides: str, policy: str = "any") -> Experiment:
 
 
 def of(name: str, policy: str = "any", overrides: Sequence[str] = ()) -> Experiment:
-    own = (f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0")
-    return experiment(*own, *overrides, policy=policy)
+    vehicle = (f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0")
+    return experiment(*vehicle, *overrides, policy=policy)
 
 
 def random_policy(of: Experiment) -> Policy:
@@ -113,10 +113,11 @@ def test_the_environment_flies_every_vehicle_with_its_limits_and_reports_them():
     env = ThrowEnv(experiment("task.start.tether_variants=2"), "cpu", seed=1, count=12)
     drawn, given_setup = members(env.cfg), env.get_observations()["actor"][:, -4:]
     for e in range(12):
-        own = drawn[e % 6 // 2]
-        assert given_setup[e].tolist() == approx(own.given_setup, rel=1e-6)
+        member = drawn[e % 6 // 2]
+        assert given_setup[e].tolist() == approx(member.given_setup, rel=1e-6)
         assert (
-            float(env.delay.age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
+            float(env.delay.age[e]) * member.units.time
+            <= env.cfg.task.observation.latency[1] + 1e-6
         )
     env.carry(torch.ones(12, 5))
     queued = env.views.command[:, 0]
@@ -130,17 +131,17 @@ def test_the_environment_flies_every_vehicle_with_its_limits_and_reports_them():
 def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name, kind):
     base = of(name, kind, [*QUIET, "task.start.mass=0.0", "task.start.tether_variants=1"])
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
-    own, one = specialised(policy, base)
+    specialist, one = specialised(policy, base)
     pilot, units = (
-        Pilot(own, one.camera if kind == "any_vision" else None, 4),
+        Pilot(specialist, one.camera if kind == "any_vision" else None, 4),
         members(base)[0].units,
     )
     assert pilot.period == approx(0.02 * units.time)
-    assert own.total_mass == approx(plant_of(base).total_mass)
+    assert specialist.total_mass == approx(plant_of(base).total_mass)
     most, rates = members(base)[0].max_thrust, torch.tensor(base.task.action.max_rate)
     shown = env.get_observations()["actor"]
     for _ in range(15):
-        wanted = policy.act(shown)
+        action = policy.act(shown)
         state, size = {k: v.numpy() for k, v in env.views.state.items()}, units.length
         payload, goal = (
             env.views.out["payload_pos_w"].numpy() * size,
@@ -154,11 +155,11 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
             payload,
             goal,
         )
-        assert_allclose(out.action, act.clip_action(wanted).numpy(), atol=SAME)
+        assert_allclose(out.action, act.clip_action(action).numpy(), atol=SAME)
         command = act.command_from_action(torch.from_numpy(out.action), most, rates)
         assert_allclose(out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME)
         assert_allclose(out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME)
-        shown = env.carry(wanted)["actor"]
+        shown = env.carry(action)["actor"]
     assert one.rope.length == plant_of(base).rope.length
 
 

@@ -96,7 +96,7 @@ def test_bias_splits_the_mean_square():
     assert st.bias(rng.normal(0.0, 0.02, (300, 2))).share < 0.05
 
 
-def test_nothing_to_average_is_said():
+def test_an_empty_average_is_refused():
     with raises(ValueError, match="expected finite numbers"):
         st.mean([np.zeros(0)])
     with raises(ValueError, match="expected finite numbers"):

@@ -31,13 +31,13 @@ def endless(number: int) -> int:
 
 
 def test_one_process_works_here_and_in_order():
-    seen = []
-    assert list(done(lambda x: seen.append(os.getpid()) or x, [3, 1, 2])) == [
+    processes = []
+    assert list(done(lambda x: processes.append(os.getpid()) or x, [3, 1, 2])) == [
         (0, 3),
         (1, 1),
         (2, 2),
     ]
-    assert set(seen) == {os.getpid()}
+    assert set(processes) == {os.getpid()}
 
 
 @mark.slow
