@@ -121,7 +121,7 @@ class Terminal:
             self._why = (
                 "the operator said abort (Ctrl-C)"
                 if number == signal.SIGINT
-                else f"the process was told to end ({name})"
+                else f"the process received {name}"
             )
 
     def words(self, state: str) -> OperatorInput:

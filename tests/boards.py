@@ -22,7 +22,7 @@ BOARDS = {
 
 
 def lens_of(name: str) -> FisheyeParams:
-    """Return the lens that a board is drawn through."""
+    """Return the lens of a board's pictures."""
     return LARGE if name == "charuco" else LENS
 
 

@@ -27,5 +27,5 @@ def start(line: str, *words: Any, **options: Any) -> subprocess.Popen:
 
 
 def run_python(*words: Any, **options: Any) -> subprocess.CompletedProcess:
-    """Run another interpreter to its end and keep what it says."""
+    """Run another interpreter to its end and keep its output."""
     return subprocess.run([sys.executable, *words], capture_output=True, text=True, **options)

@@ -15,7 +15,7 @@ QUIET = (
     *("camera.noise.wrong_probability=0.0", "camera.noise.held_probability=0.0"),
     *("camera.mount.rotation_error_std=0.0", "camera.mount.position_error_std=0.0"),
 )
-"""Overrides after which what is measured is exact and current, and commands arrive as sent."""
+"""Overrides that make measurements exact and current, and commands arrive as sent."""
 
 
 def quiet(name: str, *overrides: str) -> Experiment:

@@ -7,7 +7,7 @@ from pytest import fixture, hookimpl
 from visthrow.diagnose.likelihood.threads import limit_to_one_thread
 
 limit_to_one_thread()
-gc.disable()  # nothing of what is collected and imported becomes garbage
+gc.disable()  # collected and imported objects never become garbage
 
 
 @hookimpl(tryfirst=True)
@@ -30,7 +30,7 @@ def one_thread():
 
 @fixture
 def refused(capsys):
-    """Function that runs a command, which must end with status 2 and say why."""
+    """Function that runs a command, which must end with status 2 and a message."""
     from tests.commands import run_command
 
     def run(line, *words, message, sets=()):

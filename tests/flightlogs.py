@@ -26,7 +26,7 @@ UNITS = {name: (spec.unit, spec.frame) for name, spec in STANDARD_CHANNELS.items
 
 G = 9.81
 DELAY = 0.04
-"""Of a smooth flight's rates behind its commands [s]."""
+"""Lag of a smooth flight's rates behind its commands [s]."""
 
 
 def log_at(time: np.ndarray, **columns: np.ndarray) -> FlightLog:

@@ -1,6 +1,4 @@
-"""Byte strings and messages that nobody meant: what the links' tests throw at them, each drawn from
-a seed that is kept.
-"""
+"""Random byte strings and messages for the tests of links, each drawn from a recorded seed."""
 
 import numpy as np
 from pymavlink.generator.mavcrc import x25crc
@@ -19,8 +17,8 @@ KINDS = tuple(sorted(mav.mavlink_map))
 
 
 def framed(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
-    """A message, of the vehicle by its ids, with a right checksum over any content, so that its
-    fields reach whoever listens.
+    """A message with the vehicle's ids and a right checksum over any content, so that its fields
+    reach the listeners.
     """
     number = kind.id
     head = bytes([len(body), 0, 0, 0, *ids])

@@ -41,7 +41,7 @@ def params(*overrides: str) -> HilParams:
 
 
 def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:
-    """A network that always says the same; hover needs `HOVER` first."""
+    """A network with a constant action; hover needs `HOVER` first."""
     shipped = Policy.load(find_policy(layout))
     return Policy(
         (torch.zeros(5, shipped.obs_dim),), (torch.tensor(action),), "relu", shipped.contract
@@ -92,7 +92,7 @@ class Vehicle:
 
 
 class Spy(DryRun):
-    """A back-end that keeps what it is given."""
+    """A back-end that records its calls."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -138,8 +138,8 @@ def fly(
     watch: Callable[[float, TickRecord], None] | None = None,
     recording: Callable[[float], bool] = lambda time: True,
 ) -> list[TickRecord]:
-    """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` spoil what the
-    runner is told.
+    """Fly for a time; ``poses``, ``status``, ``words``, ``late`` and ``recording`` disturb the
+    runner's inputs.
     """
     vehicle, decisions, command = Vehicle(), [], None
     waiting: list[Pose] = []

@@ -17,7 +17,7 @@ AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
 
 
 def saved_policy(folder: Path, action=AT_ONCE) -> str:
-    """File of a policy that always says the same, as an override of a config."""
+    """File of a policy with a constant action, as an override of a config."""
     path = folder / "always.npz"
     simple_policy(action, "vision").save(path)
     return f'policy="{path}"'

@@ -1,5 +1,5 @@
-"""A plant of a few lines: it stands in the air whatever it is told, turns a little as it is told,
-and drops the payload at its feet.
+"""A plant of a few lines: it stays in the air under any command, turns a little as commanded, and
+drops the payload at its feet.
 
 For what concerns protocol, faults and time alone: no simulator is needed for it.
 """
@@ -22,8 +22,8 @@ class LevelPlant:
     """See `hil.rehearsal.fake.WirePlant`.
 
     Attributes:
-        released: when the release came [s]. commands: all that it was told, the last ones of a long
-            flight.
+        released: when the release came [s]. commands: all that it received, of a long flight the
+            last ones.
     """
 
     period, home_w, mass, max_thrust = 0.01, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0

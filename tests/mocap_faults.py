@@ -1,5 +1,5 @@
-"""What goes wrong with a motion capture: from a time on, drawn from a seed, put into poses as the
-source writes them.
+"""Faults of a motion capture: from a time on, drawn from a seed, applied to poses as the source
+writes them.
 
 python -m tests.mocap_faults NAME TIME hil fake ...    # a fake whose motion capture has the fault
 from that time on [s]"""
@@ -81,7 +81,7 @@ FAULTS: dict[str, tuple[str, Spoil]] = {
         lambda poses, fault: [p for p in poses for _ in range(2)],
     ),
 }
-"""Name -> what happens, and what makes it happen."""
+"""Name -> description of the fault, and the function that causes it."""
 
 
 @dataclass
@@ -100,9 +100,7 @@ class MocapFault:
         self.kept: dict[str, float] = {}  # stamps of those let through, by body
 
     def spoil(self, poses: list[Pose], time: float) -> list[Pose]:
-        """Return what becomes of the poses that were measured at a time [s], as the source writes
-        them.
-        """
+        """Return the poses measured at a time [s] with the fault, as the source writes them."""
         if time < self.start:
             self.last.update({p.body: p for p in poses})
             return poses

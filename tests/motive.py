@@ -44,7 +44,7 @@ def frame(stamp: float, *bodies: tuple[int, tuple, tuple, bool]) -> bytes:
 
 
 class Motive:
-    """Streams to whoever has said hello; ``client`` is its address."""
+    """Streams to the last client that connected; ``client`` is its address."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -1,4 +1,4 @@
-"""A plant of a few lines that falls, climbs and turns as it is told, a little late; the payload
+"""A plant of a few lines that falls, climbs and turns as commanded, a little late; the payload
 hangs straight below it.
 
 For what concerns weight, thrust and signs: no simulator is needed for it.
@@ -11,10 +11,10 @@ from visthrow.common.rotations import multiply, rotate_one
 from visthrow.onboard.hover import GRAVITY
 
 LAG = 0.06
-"""From a command to 63 % of its effect [s]."""
+"""Time from a command to 63 % of its effect [s]."""
 
 HANG = 0.383
-"""Of the payload below the vehicle [m]."""
+"""Distance of the payload below the vehicle [m]."""
 
 
 class PointPlant(LevelPlant):

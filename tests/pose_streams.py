@@ -58,7 +58,7 @@ def bursts(rng):
 
 @dataclass(frozen=True)
 class PoseStream:
-    """A stream, and what the check says of it; empty where it is good."""
+    """A stream, and the check's message; empty where it is good."""
 
     says: str
     samples: Callable[[np.random.Generator], Iterator[Sample]] = field(default=regular(100.0))

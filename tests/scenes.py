@@ -1,5 +1,5 @@
-"""Scenes: a quadrotor, a rope and a schedule of wrenches, which every plant of the project flies;
-from files, and what acts when.
+"""Scenes, read from files: a quadrotor, a rope and a schedule of wrenches, which every plant of the
+project flies.
 """
 
 import tomllib

@@ -243,7 +243,7 @@ class SyntheticModel(Model):
 
 
 def altered(change: Callable[[SyntheticModel, Window], Window], **options) -> SyntheticModel:
-    """Return flights after something was done to each of their windows."""
+    """Return flights with a change applied to each of their windows."""
     model = SyntheticModel(**options)
     model._windows = [change(model, w) for w in model._windows]
     return model

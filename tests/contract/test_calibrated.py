@@ -1,5 +1,5 @@
-"""Throws that begin with a calibration in the hover: what is wrong with each camera is found, and
-made up for.
+"""Throws that begin with a calibration in the hover: the errors of each camera are estimated and
+corrected.
 """
 
 import numpy as np

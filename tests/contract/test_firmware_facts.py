@@ -1,8 +1,8 @@
 """A constant that stands for a firmware's behaviour comes from the table of facts.
 
 In modules that speak for a firmware no number stands outside of module constants and defaults, but
-those of arithmetic; parameter names stand in rows of the table. What a module constant may hold is
-ours: :data:`CHOICES` names each.
+those of arithmetic; parameter names stand in rows of the table. :data:`CHOICES` names each module
+constant that is our choice.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""Replays of runs are exact, whatever went wrong in them."""
+"""Replays of runs are exact, even of runs with faults."""
 
 import math
 from dataclasses import replace

@@ -20,7 +20,7 @@ from visthrow.task import load_experiment
 COUNT = 5
 STEPS = 12
 RELEASED = 4
-"""Step at which some environments ask for the release."""
+"""Step at which some environments get the release command."""
 
 
 def start_spreads():
@@ -144,7 +144,7 @@ def test_a_masked_reset_leaves_the_rest():
 
 
 def test_a_reset_leaves_nothing_of_the_last_episode():
-    """An environment that flew wildly and was put back flies to the bit as one that never did."""
+    """An environment that is reset after a wild flight equals a fresh one to the bit."""
     used, fresh = (HybridSim(paper_plant(), COUNT, seed=7) for _ in range(2))
     drive(used, random_commands(4, STEPS, COUNT), np.ones(COUNT))
     start, commands = poses(5, COUNT), random_commands(5, STEPS, COUNT)
@@ -178,9 +178,7 @@ def test_draws_do_not_depend_on_the_batch():
 
 @mark.parametrize("place", range(4))
 def test_a_bad_command_raises_a_bit_and_does_not_spread(place):
-    """Not a number in one environment: its bit is set, its last command is held, the others never
-    notice.
-    """
+    """NaN in one environment: its bit is set, its last command is held, others are unchanged."""
     sick, well = HybridSim(paper_plant(), 3), HybridSim(paper_plant(), 3)
     command = np.tile([4.0, 1.0, 0.5, 0.0], (3, 1))
     bad = command.copy()

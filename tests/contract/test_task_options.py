@@ -1,4 +1,4 @@
-"""What the task can do beyond the paper: moving goals, varied payloads; and flying under stated
+"""Options of the task beyond the paper: moving goals, varied payloads; and flying under stated
 departures from a contract.
 """
 
@@ -103,7 +103,7 @@ def test_payloads_vary_in_every_combination():
     env = ThrowEnv(params, count=300)
     hanging = (env.views.out["payload_pos_w"] - env.views.state["pos_w"]).norm(dim=1)
     assert hanging.max() - hanging.min() > 0.05, "cables of 0.297 to 0.363 m"
-    assert env.get_observations()["actor"].shape == (300, 35), "the actor is told nothing"
+    assert env.get_observations()["actor"].shape == (300, 35), "no input of the payload"
     assert env.get_observations()["critic"].shape == (300, 44)
 
 
@@ -151,8 +151,8 @@ def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
 
 
 def test_a_policy_is_not_flown_in_wind_or_under_laws_without_allowance():
-    """Those that ship were trained without either, and fly. Laws have no other units, which flying
-    any vehicle takes.
+    """The shipped policies were trained without either, and fly. Laws have SI units alone, unlike
+    vehicles of a class.
     """
     assert not {"air", "laws"} & contract_of(experiment("state")).keys()
     law = (
@@ -202,8 +202,8 @@ def test_speeds_that_make_no_range_are_refused():
 
 
 def test_a_policy_is_flown_without_what_only_its_training_had():
-    """``flown`` of its configuration comes before what the user names; a latency that it was
-    trained for is no refusal.
+    """``flown`` of its configuration comes before the user's overrides; a latency within its
+    training is accepted.
     """
     loaded, named = (
         load_policy("vision"),

@@ -1,4 +1,4 @@
-"""What is tracked holds no path or host of the machine that it was written on."""
+"""Tracked files hold no path or host of the machine that they were written on."""
 
 import re
 import subprocess

@@ -1,5 +1,5 @@
-"""Symmetries, degenerate pairs and spoiled logs of sealed worlds; the default run tests what they
-are made of.
+"""Symmetries, degenerate pairs and spoiled logs of sealed worlds; the default run tests their
+parts.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def test_of_hours_of_flight_all_throws_and_the_liveliest_windows_are_looked_at()
 
 
 def explain_failure(line: dict) -> str:
-    """Why a case failed."""
+    """Explain why a case failed."""
     return (
         f"{line['kind']} {line['recipe']}: {line.get('said')} {line.get('error', '')}"
         f" {line.get('output', '')}"
@@ -78,8 +78,8 @@ def explain_failure(line: dict) -> str:
 @mark.slow
 @mark.parametrize("kind", [*cases.KINDS, *PAIRS, *BAD])
 def test_a_case_passes(kind):
-    """Symmetries hold, the plan separates what is a class, and bad logs get no name; in a world
-    drawn now.
+    """Symmetries hold, the plan separates the members of a class, and bad logs get no name; in a
+    freshly drawn world.
     """
     seed = int.from_bytes(os.urandom(4))
     line = cases.run_case(cases.Task(kind, cases.draw(kind, seed), np.inf))

@@ -1,4 +1,4 @@
-"""What is hidden must be found: the tool passes the suite of :mod:`bench.diagnose.finding`, and
+"""Hidden effects must be found: the tool passes the suite of :mod:`bench.diagnose.finding`, and
 four spoilt tools do not.
 """
 
@@ -20,7 +20,7 @@ SPOILT = {
         kinds[0].hidden[0], next(x for x in finding.SINGLE if x != kinds[0].hidden[0]), real
     ),
 }
-"""What is wrong with a tool -> it, made for these kinds of worlds and from the real one."""
+"""Fault of a spoilt tool -> the tool, made for these kinds of worlds and from the real one."""
 
 
 def most_common(kinds) -> str:
@@ -38,7 +38,7 @@ def suite():
 
 @fixture(scope="module")
 def real():
-    """The tool itself, which is asked once about the same logs."""
+    """The tool itself, which diagnoses the same logs only once."""
     return finding.once(finding.explain)
 
 
@@ -55,7 +55,7 @@ def test_a_spoilt_tool_is_caught(name, suite, real):
 
 @mark.slow
 def test_effects_exchanged_in_the_catalogue_are_noticed(monkeypatch):
-    """Worlds of another hand notice; worlds of the simulator's own equations would not."""
+    """Worlds with independent equations detect it; the simulator's equations would not."""
     known = catalogue()
     one, other = known["com_x"], known["com_y"]
     monkeypatch.setitem(known, "com_x", replace(one, changes=other.changes))

@@ -1,4 +1,4 @@
-"""The record of the trust page says what the shipped ledger says."""
+"""The record of the trust page agrees with the shipped ledger."""
 
 import json
 from pathlib import Path

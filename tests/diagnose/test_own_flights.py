@@ -1,5 +1,5 @@
-"""Flights of ``visthrow fly`` against the simulator that flew them: there is nothing to find, and
-nothing is.
+"""Flights of ``visthrow fly`` against the simulator that flew them: the diagnosis must find
+nothing.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from visthrow.throws.recorded import MEASURED, fly
 
 SEEDS = (1,)
 LATE = (8e-3, 12e-3)
-"""Age of what the pilot of these flights is told [s]."""
+"""Age of the poses that the pilot of these flights receives [s]."""
 
 
 @fixture(scope="module")
@@ -24,7 +24,7 @@ def flown():
 
 
 def diagnose(loaded, logs) -> diagnose_flights.Diagnosis:
-    """What ``explain`` says of logs."""
+    """Diagnose logs as ``explain`` does."""
     experiment = loaded.experiment
     return diagnose_flights.explain(
         ThrowModel(logs, plant_of(experiment), sensing=experiment.sensing)
@@ -32,9 +32,7 @@ def diagnose(loaded, logs) -> diagnose_flights.Diagnosis:
 
 
 def test_flights_of_fly_hide_nothing(flown):
-    """They did where measured poses were stamped when the pilot read them, 10 ms late: a release
-    lag, and UNKNOWN.
-    """
+    """Poses stamped when the pilot reads them, 10 ms late, gave a release lag, and UNKNOWN."""
     diagnosis = diagnose(*flown)
     assert (diagnosis.overall, dict(diagnosis.theta), diagnosis.events) == ("NO EFFECT", {}, ())
 

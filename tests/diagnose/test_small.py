@@ -1,5 +1,5 @@
-"""Laws in the models of setups: told where an independent generator hid one, written into the
-setup, and worth it on flights never seen.
+"""Laws in the models of setups: reported where an independent generator hid one, written into the
+setup, and better on held-out flights.
 """
 
 import json
@@ -83,7 +83,7 @@ def undisturbed(kind: str) -> tuple[NumericModel, list[Window]]:
 
 @mark.parametrize(("kind", "law"), ACTING)
 def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
-    """Two ways to the same: forces at the knots through the latents' derivatives, and the law in
+    """Two computations agree: forces at the knots through the latents' derivatives, and the law in
     every step.
 
     The kind's other laws stand beside it with a coefficient of 0, so that one kernel serves all.

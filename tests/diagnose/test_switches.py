@@ -1,6 +1,4 @@
-"""Kinds of blocks that a model lacks: what tells of them is told between two fits, not between a
-fit and a transient.
-"""
+"""Kinds of blocks that a model lacks: their evidence compares two fits, no transient."""
 
 import numpy as np
 from pytest import approx, mark, param

@@ -2,11 +2,11 @@
 beside it.
 
 A pilot holds it until stick frames come; then the override switch goes on (or, with all channels by
-MSP, the arming channel takes it). What silence does under the override follows the version: since
-2026.6 the pilot's own sticks count again, before that the last frame counts for ever. With all
-channels by MSP the motors idle, then it disarms, and an arming channel that is high when the
-receiver comes back arms nothing before it was low. Pitch stick forward is nose down. Outputs of
-CHANNEL_FORWARDING are not in MSP_SERVO. It hears no poses.
+MSP, the arming channel takes it). Silence under the override depends on the version: since 2026.6
+the pilot's sticks count again, before that the last frame counts for ever. With all channels by MSP
+the motors idle, then it disarms, and an arming channel that is high when the receiver comes back
+arms nothing before it was low. Pitch stick forward is nose down. Outputs of CHANNEL_FORWARDING are
+not in MSP_SERVO. It hears no poses.
 
 Source: `hil.links.facts`, betaflight."""
 
@@ -52,7 +52,7 @@ SIZES = {
     msp.FACTS["MSP_RC_DEADBAND"]: 5,
     msp.FACTS["MSP_RX_CONFIG"]: 7,
     msp.FACTS["MSP_FAILSAFE_CONFIG"]: 8,
-}  # bytes of the answers that tell settings
+}  # bytes of the answers that hold settings
 
 
 def rate_at(rates: RatesParams, axis: int, us: float) -> float:

@@ -63,7 +63,7 @@ class FakeCrazyflie(PortFake):
 
     Attributes:
         placed: external poses that came, position [m] and attitude xyzw. supervisor: its state.
-        protocol: version that it tells. priority: of the set-point that is flown.
+        protocol: version that it reports. priority: of the set-point that is flown.
         hook_opens: value of the mechanism's parameter that opens it.
     """
 
@@ -87,7 +87,7 @@ class FakeCrazyflie(PortFake):
         self.protocol, self.priority, self.hook_opens = FACTS["protocol_state"], 0, 1
         self.supervisor = PASSED
         self.held = SetPoint()  # by the commander
-        self._begun = False  # whether somebody holds it in the hand no longer
+        self._begun = False  # whether it was released from the hand
         self._turned = -math.inf  # of the supervisor [s]
         self._since = self._thrust_at = 0.0  # of the supervisor's state, of the last thrust [s]
         self._tilted: float | None = None
@@ -305,9 +305,7 @@ class FakeCrazyflie(PortFake):
         self.parameters["stabilizer.stop"] = 1
 
     def flown(self) -> np.ndarray:
-        """Return the command of this period; before the runner has it somebody holds it in the
-        hand.
-        """
+        """Return the command of this period; before the takeover a person holds the vehicle."""
         self._sense()
         self._supervise()
         place_w, target = self.held.place_w, self._target
@@ -339,7 +337,7 @@ class FakeCrazyflie(PortFake):
         return tilt_and_heading(tuple(self.plant.state["quat_wb"].tolist()))[1]
 
     def _rates(self, target: np.ndarray) -> np.ndarray:
-        """Return the body rates that the PID controller asks for [rad/s], forward, left, up."""
+        """Return the body rates that the PID controller commands [rad/s], forward, left, up."""
         rates = target[1:].copy()
         if self.supervisor == LEVEL:
             x, y, z, w = map(float, self.plant.state["quat_wb"])

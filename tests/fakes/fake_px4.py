@@ -1,10 +1,10 @@
 """A fake PX4.
 
-OFFBOARD is refused until set-points have come for a second without a gap, and left for what
-COM_OBL_RC_ACT says when they cease for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and
-ACCEPTED when PD_GRIPPER_TO is over, whatever moves; the gripper opens to its output's minimum;
-there is no PD_GRIPPER_EN since 1.17; integer parameters travel as bytes. Out of OFFBOARD set-points
-vanish without a word. Its heartbeat comes once a second and with no change of mode. Until it is
+OFFBOARD is refused until set-points have come for a second without a gap, and left for the mode of
+COM_OBL_RC_ACT when they cease for COM_OF_LOSS_T; DO_GRIPPER is answered IN_PROGRESS, and ACCEPTED
+after PD_GRIPPER_TO, whether anything moves or not; the gripper opens to its output's minimum; there
+is no PD_GRIPPER_EN since 1.17; integer parameters travel as bytes. Out of OFFBOARD set-points are
+ignored without a message. Its heartbeat comes once a second and with no change of mode. Until it is
 taken the pilot holds it in Position mode."""
 
 from typing import Any

@@ -63,7 +63,7 @@ class ListeningPort:
 
 
 class AnsweringPort(UdpPort):
-    """A UDP port that answers whoever spoke last: what a vehicle in software offers."""
+    """A UDP port that answers the last sender: what a vehicle in software offers."""
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         return super().write(data, to or self.sender)

@@ -1,5 +1,5 @@
-"""What goes wrong on the autopilot's side, over the wire: what the runner did, and how soon; what
-the vehicle did without it.
+"""Faults on the autopilot's side, over the wire: the runner's reaction and its delay; the vehicle's
+behaviour without it.
 
 In every one the fake watches that no command arrives that is not finite or within limits, and that
 the release comes once at most, from an armed vehicle inside its fence."""
@@ -78,9 +78,7 @@ def test_silent(kind):
 
 @mark.parametrize("kind", AUTOPILOTS)
 def test_the_pilot_takes_over(kind):
-    """Abort at the next sign of life; from then on not one command is sent, no mode is
-    asked for.
-    """
+    """Abort at the next sign of life; from then on no command is sent and no mode requested."""
 
     def watch(now, runner, fake):
         if now >= START + 0.3:
@@ -97,8 +95,8 @@ def test_the_pilot_takes_over(kind):
 
 @mark.parametrize("before", [0.0, 0.02, 0.06])
 def test_a_pilots_hold_at_the_end_of_a_throw_stands(before):
-    """The runner wants Hold itself a moment later, before a heartbeat has told of the pilot's: it
-    does not take the mode for its own, and asks for no Land.
+    """The runner requests Hold a moment later, before a heartbeat has reported the pilot's: it does
+    not take the mode for its own, and requests no Land.
     """
     taken = []
 
@@ -126,7 +124,7 @@ def test_disarmed_and_not_ours_to_arm(kind):
     ("kind", "override"), [("ardupilot", "ardupilot.arm=true"), ("px4", "px4.arm=true")]
 )
 def test_refuses_arming(kind, override):
-    """Asked to arm it is in READY; the refusal ends the run, with what the autopilot said."""
+    """It refuses to arm in READY; that ends the run, with the autopilot's message."""
     notes = []
 
     def listen(now, runner, fake):
@@ -250,9 +248,9 @@ def test_a_runner_that_is_killed_in_mid_throw_leaves_the_vehicle_to_its_failsafe
 
 @mark.parametrize("full_at", [0.0, START])
 def test_the_disk_is_full(tmp_path, full_at):
-    """Before the throw: none is armed.
+    """Before the throw nothing is armed.
 
-    In mid throw: it is flown to its end, and said in the summary.
+    In mid-throw it is flown to its end, and reported in the summary.
     """
     params = peers(LevelPlant(), loaded=NEVER, overrides=QUICK)[0].params
     recorder = RunRecorder(tmp_path / "run", params)

@@ -1,5 +1,5 @@
 """Each back-end against its fake, in lock step: commands, modes, hand-over, parameters, release,
-and whose hands it is in.
+and who controls the vehicle.
 """
 
 import numpy as np
@@ -25,13 +25,13 @@ STEPS = round(0.02 / LevelPlant.period)
 """Of the plant in a tick."""
 
 SEPARATION = 5e-4
-"""Latch to separation against the trained lag [s]: 5 ms are asked for; the clock is simulated, so
+"""Latch to separation against the trained lag [s]: 5 ms are required; the clock is simulated, so
 that nothing else is late.
 """
 
 
 class Desk:
-    """A back-end without a runner: it is asked and told by hand."""
+    """A back-end without a runner, which the test queries and commands."""
 
     def __init__(self, kind, *overrides, **options):
         found = peers(LevelPlant(), kind=kind, loaded=AT_ONCE, overrides=overrides, **options)
@@ -72,7 +72,7 @@ class Desk:
         return self.status.connected, self.status.mode
 
     def take_over(self, mode, *words):
-        """Let the pilot choose a mode, which a heartbeat says at once."""
+        """Let the pilot choose a mode, which a heartbeat reports at once."""
         self.fake.mode, self.fake._next_beat = mode, 0.0
         self.turn(0.1, HOVER, *words)
 
@@ -80,14 +80,14 @@ class Desk:
         self.backend.release(self.now)
 
     def abort(self):
-        """Ask for the end of the flight at each tick for a while."""
+        """Request the end of the flight at each tick for a while."""
         for _ in range(20):
             self.turn(0.02)
             self.backend.abort(self.now)
 
 
 def test_of_an_autopilot_that_says_much_the_newest_words_are_kept():
-    """The newest word is the reason why it is not armed."""
+    """The last message gives the reason why it is not armed."""
     desk = Desk("ardupilot")
     desk.turn(0.5)
     for n in range(MOST_TEXTS + 1):
@@ -100,8 +100,8 @@ def test_of_an_autopilot_that_says_much_the_newest_words_are_kept():
 
 @mark.parametrize("kind", AUTOPILOTS)
 def test_units_and_axes_of_commands(kind):
-    """A quarter of a turn a second about each axis alone, and a thrust, arrive as they
-    were meant.
+    """A quarter of a turn a second about each axis alone, and a thrust, arrive with the right sign
+    and size.
     """
     desk = Desk(kind).follow()
     for command in (
@@ -242,7 +242,7 @@ def test_betaflight_waits_for_the_pilots_switch_and_refuses_one_that_is_on_too_e
 
 def test_what_silence_does_under_the_override_follows_betaflights_version():
     """Since 2026.6 the pilot's sticks count again; before, the last frame counts for ever, and the
-    audit says so before anything flies.
+    audit reports this before anything flies.
     """
     tables = []
     for version, word in (((2026, 6, 1), "ok"), ((4, 6, 0), "WARN")):
@@ -390,7 +390,7 @@ def test_px4_in_software_has_no_minimum_of_an_output():
 
 
 def test_parameters_of_the_config_are_audited_and_written():
-    """A vehicle in software becomes the policy's by them."""
+    """They make a vehicle in software the policy's."""
     overrides, found = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
     desk = Desk("px4", *overrides, parameters=found)
     desk.turn(0.5)
@@ -501,7 +501,7 @@ def test_px4_says_in_progress_first_and_that_is_pending():
     [*((kind, 0.06) for kind in AUTOPILOTS), ("ardupilot", 0.002), ("betaflight", 0.11)],
 )
 def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
-    """Measured by the fake, which knows the true separation; a faster mechanism waits for the
+    """The fake measures the true separation; the runner delays a faster mechanism by the
     difference.
 
     A latch counts from when the policy's commands of its tick act: the state that it decided on was
@@ -574,7 +574,9 @@ def test_two_throws_with_the_autopilots_hold_between_them():
     ("kind", "factor", "good"), [*((kind, 1.0, True) for kind in AUTOPILOTS), ("px4", 1.15, False)]
 )
 def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
-    """The vehicle hovers in other hands; its share of thrust is held against the config's."""
+    """The vehicle hovers under another controller; its share of thrust is compared with the
+    config's.
+    """
     hover = {"ardupilot": 0.1906, "px4": 0.1585, "betaflight": 0.1906}[kind]
     desk = Desk(kind, f"{kind}.thrust.hover={hover * factor}")
     check = AutopilotCheck(desk.runner.params, desk.backend)
@@ -594,7 +596,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
 
 
 def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():
-    """MSP_SERVO does not show them; a good release is none that moved nothing."""
+    """MSP_SERVO does not show them; a release that moves nothing must not count as good."""
     desk = Desk("betaflight", parameters={"channel_forwarding": 1}).follow()
     assert desk.backend.voltage == approx(11.1), "sent in hundredths of a volt"
     desk.release()
@@ -635,7 +637,7 @@ def test_a_mechanism_that_is_open_is_not_taken(kind, closed):
 
 @mark.parametrize("kind", ["ardupilot", "px4"])
 def test_a_mode_is_noticed_soon_though_the_heartbeat_is_slow(kind):
-    """PX4's comes once a second and says nothing of a change; it is asked for more often."""
+    """PX4's comes once a second and does not report a change; the runner requests it more often."""
     desk = Desk(kind, prompt=False).follow()
     begin = desk.now
     while desk.status.mode != HOLD:

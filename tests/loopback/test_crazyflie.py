@@ -167,7 +167,7 @@ def test_packets_and_devices(monkeypatch):
 
 def test_nobody_else_speaks_for_a_crazyflie():
     """Packets from another address neither connect, nor arm, nor release it: each is counted, and
-    their sender said once.
+    their sender reported once.
     """
     ticks, number, messages = 200, free_port(), []
     params = load_run("crazyflie", [f'crazyflie.device="udpout:127.0.0.1:{number}"'])

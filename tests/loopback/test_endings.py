@@ -19,15 +19,15 @@ STATES = {"armed": ("states.armed_least=9.0",), "throw": ()}
 """In hover, and in a throw that the policy never ends."""
 
 OVER = 2.4
-"""The time of a run that is over in flight [s]."""
+"""Time limit of a run that ends in flight [s]."""
 
 LANDS = {"ardupilot": "mode 9", "px4": "mode 4.6"}
-"""What is asked for; Betaflight has no landing of its own: the runner flies a descent."""
+"""Request at the end of a run; Betaflight has no landing mode: the runner flies a descent."""
 
 
 class Ending:
-    """The terminal's signals, the loop's parts that raise, the end of the time: done a few ticks
-    into a state.
+    """A way to end a run a few ticks into a state: a signal, a part of the loop that raises, the
+    end of the time.
     """
 
     def __init__(self, way: str, state: str, parts, monkeypatch):
@@ -72,7 +72,7 @@ class Ending:
 
     @property
     def after(self):
-        """What the vehicle did from then on, with the time since."""
+        """The vehicle's events from then on, with the time since."""
         return [
             (round(at - self.done_at, 2), text)
             for at, text in self.fake.events
@@ -93,9 +93,9 @@ def with_fake(kind: str, state: str):
 
 REASONS = {
     "SIGINT": "the operator said abort (Ctrl-C)",
-    "SIGTERM": "the process was told to end (SIGTERM)",
-    "SIGHUP": "the process was told to end (SIGHUP)",
-    "SIGQUIT": "the process was told to end (SIGQUIT)",
+    "SIGTERM": "the process received SIGTERM",
+    "SIGHUP": "the process received SIGHUP",
+    "SIGQUIT": "the process received SIGQUIT",
     "time over": "the time of the run is over",
     "source raises": "OSError: the network card has gone",
 }
@@ -103,7 +103,7 @@ REASONS = {
 
 RUNS = [("SIGINT", state, kind) for state in STATES for kind in AUTOPILOTS]
 RUNS += [(way, "throw", AUTOPILOTS[i % 3]) for i, way in enumerate(REASONS) if way != "SIGINT"]
-"""Each autopilot in each state, and each way once: what ends a run knows no autopilot."""
+"""Each autopilot in each state, and each way once: the ways do not depend on the autopilot."""
 
 
 @mark.parametrize(("way", "state", "kind"), RUNS)
@@ -140,7 +140,7 @@ def twice(monkeypatch):
 
 
 def test_a_second_ctrl_c_ends_it_at_once_and_it_lands_all_the_same(monkeypatch):
-    """The landing was asked for by the first one; the summary is there."""
+    """The first one requested the landing; the summary is written."""
     twice(monkeypatch)
     run = Ending("SIGINT", "throw", with_fake("px4", "throw"), monkeypatch)
     assert run.summary["aborted"]

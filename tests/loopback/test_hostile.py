@@ -1,5 +1,5 @@
-"""Bytes and messages from anywhere, signals, and the start: nothing of it makes the
-runner command.
+"""Bytes and messages from anywhere, signals, and the start: none of them makes the runner send a
+command.
 """
 
 import os
@@ -22,8 +22,8 @@ from tests.loopback.wire import HERE, QUICK, cut, peers
 
 
 def flood(count: int, kind: str, seed: int) -> None:
-    """Messages of every kind with any bits in their fields, spoiled poses, and noise, to a runner
-    that nobody armed.
+    """Messages of every kind with any bits in their fields, spoiled poses, and noise, to an unarmed
+    runner.
     """
     runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=AT_ONCE)
     rng, inbox, commands = default_rng(seed), source._link.port.inbox, []
@@ -42,7 +42,7 @@ def flood(count: int, kind: str, seed: int) -> None:
         inbox.extend(makers[rng.integers(len(makers))](rng) for _ in range(200))
         sent += 200
         now = clock.now() + sent * 1e-4
-        # Nobody arms: whatever comes, nothing is thrown and nothing released.
+        # Unarmed, the runner throws and releases nothing.
         runner.tick(now, source.poll(now), runner.backend.status(now), AutoOperator().words("idle"))
         runner.backend.service(now)
         fake.link.pump(clock.now)
@@ -69,8 +69,8 @@ BESIDE = 200
 
 
 def lies() -> list:
-    """What an attacker would say with the vehicle's ids: it is elsewhere, disarmed, in another
-    mode, has released, is well set up.
+    """Forged messages with the vehicle's ids: it is elsewhere, disarmed, in another mode, has
+    released, has good parameters.
     """
     quat = [1.0, 0.0, 0.0, 0.0]
     return [
@@ -113,8 +113,8 @@ def forger(rng, signed: bool, captured: list[bytes]):
 
 
 def flown(seed: int, count: int, kind: str, signed: bool):
-    """A throw in lock step beside so many forged packets: what was decided, what the vehicle took,
-    what was refused.
+    """A throw in lock step beside forged packets: the decisions, the commands that the vehicle
+    accepted, the refusals.
     """
     key = KEY if signed else None
     runner, source, clock, fake = peers(
@@ -147,8 +147,8 @@ def flown(seed: int, count: int, kind: str, signed: bool):
 
 
 def unmoved(seed: int, count: int) -> None:
-    """Forged packets, over as many throws as it takes, change no bit of what is decided, and none
-    of what the vehicle takes.
+    """Forged packets, over as many throws as needed, change no bit of the decisions or of the
+    commands that the vehicle accepts.
     """
     kind, signed = ("ardupilot", "px4")[seed % 2], seed % 4 >= 2
     alone, _, plain, _, _, _ = flown(seed, 0, kind, signed)
@@ -179,7 +179,7 @@ def test_forged_packets_change_no_bit_of_a_throw(seed):
 
 READY = 8.0
 """Processor time of a run that waits for poses, from its call to its end [s]; its start takes 1.5 s
-on a free core, 3 s are asked for. Wall time says nothing on a busy machine.
+on a free core, 3 s are allowed. Wall time means nothing on a busy machine.
 """
 
 

@@ -1,5 +1,5 @@
-"""Sources of poses against what comes at their ports: cut, random and forged datagrams and frames
-end no thread, change no throw, and are counted.
+"""Sources of poses against hostile datagrams: truncated, random and forged datagrams and frames end
+no thread, change no throw, and are counted.
 """
 
 import socket

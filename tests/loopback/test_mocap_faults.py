@@ -1,4 +1,4 @@
-"""What goes wrong with motion capture, injected over the wire: what the runner does, and how soon.
+"""Faults of motion capture, injected over the wire: the runner's reaction, and its delay.
 
 In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the same on every machine.
 """
@@ -80,8 +80,8 @@ def test_a_fault_in_mid_throw(name):
 
 @mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
 def test_a_fault_as_the_policy_asks_for_the_release(name):
-    """It asks from the first tick of the throw on; the fault is there from the start of the check:
-    nothing is released unless the poses passed all checks, and then once.
+    """The policy requests the release from the first tick of the throw on; the fault begins with
+    the check: nothing is released unless the poses passed all checks, and then once.
     """
     plant = LevelPlant()
     runner, source, clock, fake = peers(

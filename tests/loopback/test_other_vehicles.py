@@ -29,7 +29,7 @@ BY_POSES = 0.5  # and by poses alone [s]
 def fly(kind, times=1.0, spoil=lambda fake: None, yaw_lag=LAG):
     """Fly until a run is refused, given back or thrown.
 
-    Returns the runner, what it said, and how far the vehicle had sunk while it was ours [m].
+    Returns the runner, its messages, and how far the vehicle sank under our control [m].
     """
     taken = () if kind in ("betaflight", "crazyflie") else (f"{kind}.take=true",)
     plant, waits = PointPlant(times, yaw_lag), []
@@ -109,7 +109,7 @@ FLOWN = [
     for i, name in enumerate(OTHERS)
     for j, kind in enumerate(KINDS)
 ]
-"""By default each on two of the autopilots, of which each meets a weight and a thrust."""
+"""By default each on two of the autopilots; each gets a weight and a thrust."""
 
 
 @mark.parametrize(("name", "kind"), FLOWN)

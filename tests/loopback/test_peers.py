@@ -1,5 +1,5 @@
-"""Who is on the wire, over UDP between sockets: strays, two senders, a bridge that restarts,
-another autopilot, cut recordings.
+"""Peers of a link, over UDP between sockets: strays, two senders, a bridge that restarts, another
+autopilot, cut recordings.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ class Wire:
         self.backend = make_backend(self.params, self.link)
 
     def peer(self, number=None):
-        """Somebody with a socket of its own, and what it hears."""
+        """A peer with a separate socket, and the messages that it receives."""
         port, heard = open_port(check_device(f"udpout:127.0.0.1:{number or self.number}")), []
         link = Link(port, 1, 1)
         link.listen(lambda message, arrival: heard.append(message.get_type()))
@@ -74,7 +74,7 @@ def pose(x=1.0):
 
 
 def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
-    """It came first; the vehicle is heard all the same, and the stranger gets no command."""
+    """It came first; the vehicle is still accepted, and the stranger gets no command."""
     run = wire()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.sendto(b"\0", ("127.0.0.1", run.number))
@@ -100,7 +100,7 @@ def test_poses_come_on_a_separate_port(wire):
     vehicle.send(beat())
     bridge.send(pose())
     run.poll()
-    vehicle.send(pose(9.0))  # on the autopilot's port nobody's poses are expected
+    vehicle.send(pose(9.0))  # on the autopilot's port no poses are expected
     stray.send(beat())
     bridge.send(pose(2.0))
     assert [p.pos[0] for p in run.poll(0.2)] == [2.0]

@@ -51,7 +51,7 @@ def end_in_throw(folder: Path):
 
 
 def test_sigterm_in_mid_throw(tmp_path):
-    """What systemd, `timeout` and a shutdown send. Signed."""
+    """The signal of systemd, `timeout` and a shutdown. Signed."""
     NEVER.save(tmp_path / "never.npz")
     key = tmp_path / "key"
     key.write_text("a phrase that both know\n")
@@ -62,7 +62,7 @@ def test_sigterm_in_mid_throw(tmp_path):
     pair = Pair((*sign, *set_words(settings)), (*sign, *plant, *FAKE))
     summary, report = pair.fly(tmp_path / "run", end_in_throw(tmp_path / "run"))
     assert summary["aborted"]
-    assert summary["reason"] == "the process was told to end (SIGTERM)"
+    assert summary["reason"] == "the process received SIGTERM"
     assert (report["breaches"], report["releases"]) == ([], 0)
     assert "mode 9" in [text for _, text in report["events"]]
 

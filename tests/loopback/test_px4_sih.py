@@ -63,8 +63,8 @@ def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulat
 
 
 class OtherSide:
-    """PX4's side of the bridge's own link: the true state, outputs, parameters; it hears which
-    streams are asked for.
+    """PX4's side of the bridge's link: the true state, outputs, parameters; it records the
+    requested streams.
     """
 
     def __init__(self, port):
@@ -85,7 +85,7 @@ class OtherSide:
         """Fly a vehicle that stays where it is for some periods, a state ahead of the bridge; PX4's
         clock is its own: 100 s ahead. Yields the number of each period that was flown.
         """
-        while bridge._place is None:  # it asks for the world's origin once it has heard somebody
+        while bridge._place is None:  # it requests the world's origin after the first message
             self.say(0.0, pos, yaw, output(0))
             bridge.step()
         self.say(100.0, pos, yaw, output(0))
@@ -173,7 +173,7 @@ def test_the_place_is_smooth_though_px4_cuts_it_to_centimetres():
 
 
 def test_an_output_that_was_open_before_releases_nothing(bridge):
-    """After a throw PX4's gripper stays open until it is told to close; then it may open again."""
+    """After a throw PX4's gripper stays open until a command closes it; then it may open again."""
     opens = bridge.params.servo_open_us
 
     def output(n):

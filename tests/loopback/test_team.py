@@ -90,7 +90,7 @@ def test_a_lost_link_means_no_release_and_the_hover(pair):
 
 
 def test_lost_words_part_the_releases_by_as_many_ticks(pair):
-    """The first one lets go by the second one's word, and says so until that is heard."""
+    """The first one releases by the second one's message, and repeats this until it is received."""
     pair.turn(300, throwing)
     first, second = pair.loops
     say, lost = first.team.say, []
@@ -110,7 +110,7 @@ def test_lost_words_part_the_releases_by_as_many_ticks(pair):
 
 
 def test_a_stranger_is_not_heard(pair):
-    """It says what the second member would, from another port."""
+    """It sends the second member's messages from another port."""
     pair.turn(300, throwing)
     first, second = pair.loops
     second.team.say = lambda ready: None

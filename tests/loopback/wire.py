@@ -173,8 +173,8 @@ def cut(runner, source, clock, operator, recorder, seconds, tell):
 
     Its summary.
 
-    ``tell`` is handed the first decision of each state; what is waited for stands in those of
-    `Loop` itself."""
+    ``tell`` gets the first decision of each state; `Loop` itself also reports what a state waits
+    for."""
     states = []
 
     def change(decision):

@@ -1,5 +1,5 @@
 """Effects that a kernel holds only if built for them, against the reference plant and scipy; off,
-they are not there.
+they change nothing.
 """
 
 import numpy as np
@@ -75,7 +75,7 @@ CASES = {
     "jet": {"rope.downwash": 0.05},
     "mount": {"rope.mount_damping": 2e-3},
 }
-"""Parameters of which both plants have the equation; what the vehicle does knows nothing of the
+"""Parameters of which both plants have the equation; the vehicle's motion does not depend on the
 number of segments.
 """
 
@@ -95,7 +95,7 @@ def let_go(plant):
     """When a swinging payload separated [s] and how fast it then was [m/s], by this simulator and
     the reference.
 
-    It is asked for after three periods: the pull is known once a step was done.
+    The release is commanded after three periods: the pull is known once a step was done.
     """
     tilt, still = (
         np.tile([np.sin(0.9), 0.0, -np.cos(0.9)], (1, plant.rope.segments, 1)),

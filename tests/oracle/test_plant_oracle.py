@@ -17,7 +17,7 @@ from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor, numerics, random_commands
 
 COUNT, RELEASE_STEP = 4, 12
-"""Environments; step at which every second one asks for the release."""
+"""Environments; step at which every second one gets the release command."""
 USUAL = {"rope.segments": 1, "vehicle.queue.delay": 0.0213, "release.lag": 0.1037}
 """A delay and a lag that fall inside substeps. `test_chain_oracle` flies all segments."""
 CASES = {
@@ -90,8 +90,8 @@ def test_whole_plant(name):
 
 
 def test_orders_of_the_integrators_without_a_rope():
-    """Gentle commands keep the mixer off its limits, where order 1 and 4 can be seen; no other code
-    is needed.
+    """Gentle commands keep the mixer off its limits, where orders 1 and 4 differ; no other code is
+    needed.
     """
     vehicle = plant_of({}).vehicle
 

@@ -75,7 +75,7 @@ def test_mujoco_ends_the_hard_throw_at_the_same_place():
 
 @needs_physx
 def test_physx_converges_onto_the_chain():
-    """Of first order in its step; measured 8.1 and 2.0 mm."""
+    """First order in its step; measured 8.1 and 2.0 mm."""
     coarse, fine = (off_converged("physx", step) for step in (2e-3, 5e-4))
     assert coarse < 0.01
     assert coarse / fine == approx(4.0, rel=0.15)
@@ -161,7 +161,7 @@ def hanging(name: str, **vehicle) -> HybridSim:
 
 @mark.parametrize("name", ["box", "two_cables", "rod_gripper"])
 def test_other_payloads_hang_where_the_geometry_says(name):
-    """And weigh what they weigh: a vehicle that lifts them by their weight stays."""
+    """They weigh what they should: a vehicle with a thrust of the total weight stays."""
     sim = hanging(name)
     rope, weight = sim.params.rope, GRAVITY * sim.params.total_mass
     for _ in range(25):

@@ -2,8 +2,8 @@
 
 A fence is run by its language: ``sh`` a line at a time, ``python`` as one program, and any language
 with a ``title="NAME"`` becomes the file of that name beside the commands. ``text`` is what the
-commands above it printed, which is compared. Comments in front of a fence, unseen by a reader, say
-more:
+commands above it printed, which is compared. Comments in front of a fence, which readers do not
+see, give options:
 
     <!-- run with: --throws 2 -->
         these arguments are added to each visthrow command of the block, to make it cheaper
@@ -56,7 +56,7 @@ FENCE = re.compile(
 )
 NUMBER, TIMED = re.compile(r"\d+(?:\.\d+)?"), re.compile(r" [\d.]+ s$")
 TOLERANCE = 0.1
-"""Of a number that a page shows, relative; two units of its last place come on top."""
+"""Relative tolerance of a number on a page, plus two units of its last place."""
 PATIENCE = 300.0
 """For the processes of one block [s]."""
 

@@ -20,7 +20,7 @@ def plant(lag: float) -> PlantParams:
 
 
 def thrown(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict]:
-    """Outputs of every step; the release is asked for at one step only."""
+    """Outputs of every step; the release is commanded at one step only."""
     rows = []
     for k, command in enumerate(commands):
         sim.set_command(command, np.full(sim.count, k == release_step))
@@ -39,8 +39,8 @@ def thrown(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict
 
 @mark.parametrize("lag", [0.0, 0.004, 0.02, 0.1037, 0.11])
 def test_the_latch_keeps_and_the_lag_is_exact(lag):
-    """Asked for once, at the start of step 3; separation follows by itself, in the right step and
-    at the right time.
+    """Commanded once, at the start of step 3; separation follows in the right step and at the right
+    time.
     """
     release_step, count = 3, 2
     sim = HybridSim(plant(lag), count)
@@ -68,7 +68,7 @@ def test_asking_again_or_no_more_changes_nothing():
 
 
 def test_outputs_stay_after_the_landing_step():
-    """What a release put out stays until the next one: the learner may read it a step later."""
+    """A release's outputs stay until the next one: the learner may read them a step later."""
     sim = HybridSim(plant(0.02), 1)
     command = [[3.0, 0.5, 0.0, 0.0]]
     kept = None

@@ -27,28 +27,26 @@ from tests.configs import load_run
 pytestmark = mark.sitl
 
 ANSWER = 15.0
-"""Time in which an autopilot that runs says something [s]."""
+"""Time in which a running autopilot sends a message [s]."""
 
 STEP, HALF_STEP = 1.5, 0.25
-"""Body rate that is asked for [rad/s], and the time in which half of it must be there [s]: 55 to 98
-ms were measured.
-"""
+"""Commanded body rate [rad/s], and the time to reach half of it [s]: 55 to 98 ms were measured."""
 
 PERIOD = 0.02
 """Between two commands [s]."""
 
 
 POSITION = 60.0
-"""ArduPilot's estimator takes so long at most to know where the vehicle is [s]."""
+"""Longest time of ArduPilot's estimator to a position [s]."""
 
 HOVER_SHARE = {"ardupilot": ("ardupilot.thrust.hover=0.39",), "px4": ()}
-"""Of the vehicle in the autopilot's own software: with the fakes' share it does not lift, or shoots
-away.
+"""Hover share of the autopilot's simulated vehicle: with the fakes' share it does not lift, or
+shoots away.
 """
 
 
 class Bench:
-    """An autopilot in software, spoken to by hand."""
+    """An autopilot in software, which the test commands directly."""
 
     def __init__(self, kind: str, *overrides: str):
         address = os.environ.get(f"VISTHROW_SITL_{kind.upper()}")
@@ -90,7 +88,7 @@ class Bench:
         return until is None
 
     def stream(self, number: int, interval: float) -> None:
-        """Ask for a message every so many microseconds."""
+        """Request a message at an interval [us]."""
         values = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval, *[0.0] * 5
         self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
 
@@ -180,7 +178,7 @@ TAKE = {
 WRITTEN = {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "SERVO9_FUNCTION": 0.0}
 """Of ArduPilot: without the first a thrust is a climb rate.
 
-Not what the audit wants of its position: here it comes from a GPS.
+The audit's requirement on its position is left out: here it comes from a GPS.
 """
 
 
@@ -218,8 +216,8 @@ def test_the_release_is_answered_and_moves(bench, kind):
 
 @mark.parametrize("kind", KINDS)
 def test_the_autopilots_hold_takes_over(bench, kind):
-    """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its
-    estimator is fed with.
+    """It needs a position: in ArduPilot's software from the simulated GPS, in PX4's from any input
+    of its estimator.
     """
     more = ("ardupilot.hold_mode=5", "ardupilot.follow_mode=4") if kind == "ardupilot" else ()
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind], *more)

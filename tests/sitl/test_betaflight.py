@@ -43,7 +43,7 @@ TICK = 0.02
 """Between two commands [s]."""
 
 STEP = np.array([1.5, 1.5, 1.0])
-"""Rates that are asked for about x, y, z [rad/s]."""
+"""Commanded rates about x, y, z [rad/s]."""
 
 HALF_STEP = 0.15
 """Time to half of a step [s]: 55 to 90 ms were measured; a period of the commands and a late
@@ -54,7 +54,7 @@ STIFF = {"p": "11", "i": "20", "d": "8", "d_max": "8"}
 """Gains of roll and pitch that hold a rate against the swinging ball."""
 
 FASTER, SETTLED, RAMP = 20.0, 0.03, 0.15
-"""Angular acceleration [rad/s^2], from when to when its answer is looked at [s]."""
+"""Angular acceleration [rad/s^2], and the interval in which its response is measured [s]."""
 
 LEAD = 5 * 0.000529 / (5 * 0.032029) - 1.0 / (2.0 * np.pi * 250.0) - 1.0 / (2.0 * np.pi * 500.0)
 """Of the output before the rate while it grows, 15.6 ms:
@@ -68,8 +68,8 @@ quiet machine.
 """
 
 LIFT = 0.25
-"""Share by which a step of thrust may differ from what was asked for: the battery's voltage has
-changed since the calibration.
+"""Share by which a step of thrust may differ from the command: the battery's voltage has changed
+since the calibration.
 """
 
 IDLE, DISARM = (0.2, 0.6), (1.0, 2.5)
@@ -83,7 +83,7 @@ Throws on a quiet machine land 0.02 to 0.15 m off.
 """
 
 ON = 10.0
-"""Flown on after a landing [s]: the runner hovers again 3 s and has landed 6 s after it."""
+"""Time flown on after a landing [s]: the runner hovers again 3 s and has landed 6 s after it."""
 
 LONG = 200.0
 """A run on a busy machine [s]."""
@@ -269,8 +269,8 @@ def test_silence_idles_the_motors_and_disarms(bench):
 
 
 def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeypatch):
-    """The runner with its link, the firmware and the vehicle on one clock, down to the ground: what
-    a busy machine cannot change.
+    """The runner with its link, the firmware and the vehicle on one clock, down to the ground,
+    independent of the machine's load.
     """
     monkeypatch.setattr(sys.modules[throw.__module__], "AFTER", ON)
     shutil.copytree(settings[0], tmp_path / "settings")
@@ -369,7 +369,7 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
 
 
 def wait_for(process, words):
-    """Read what a process says up to a line with these words."""
+    """Read a process's output up to a line with these words."""
     lines = []
     for line in process.stderr:
         lines.append(line)

@@ -1,4 +1,4 @@
-"""What the tests of training share."""
+"""Fixtures of the training tests."""
 
 import os
 import signal
@@ -16,9 +16,7 @@ def same_bits(one_thread):
 
 @fixture(autouse=True)
 def few_throws(monkeypatch):
-    """An evaluation throws 4 times for 200: that it is made, written and printed does not hang on
-    how many.
-    """
+    """An evaluation has 4 throws for 200: its files and output do not depend on the number."""
     monkeypatch.setattr(trainer, "EVALUATED", 4)
 
 

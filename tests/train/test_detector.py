@@ -23,8 +23,7 @@ from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, plac
 
 SMALL = ["fresh=2", "pool=4", "reuse=1", "batch=2", "patches=8", "samples=1", "calibration=2"]
 NEAR = {"contours": 0.01, "learnt": 0.015}
-"""Of a keypoint that is found on a clean picture from where it projects to [-]: 3 and 5 px of 320.
-"""
+"""Errors of detected keypoints on a clean picture from their projections [-]: 3 and 5 px of 320."""
 
 
 def train(folder, *words: str) -> int:
@@ -106,9 +105,7 @@ def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):
 
 
 class Blind:
-    """Eyes that see nothing, and say of some vehicles that they do not; counts how often they are
-    asked.
-    """
+    """A detector that finds nothing, and reports so for some vehicles; counts its calls."""
 
     def __init__(self, lost=None) -> None:
         self.looks, self.last_keypoints, self._lost = 0, None, lost or {}
@@ -127,7 +124,9 @@ class Blind:
 
 
 def test_a_throw_flies_on_what_its_eyes_see_alone():
-    """With eyes that see nothing no throw comes near the goal; without eyes the same throws do."""
+    """With a detector that finds nothing no throw comes near the goal; without one the same throws
+    do.
+    """
     loaded, job = load_policy("vision"), Job((0,), 2.0, 0, 2, 0)
     blind = Blind()
     without, seeing = fly_batch([loaded], "hybrid", job, blind), fly_batch([loaded], "hybrid", job)

@@ -1,4 +1,4 @@
-"""A diagnosis is trained in, and a law that was found flies the data again."""
+"""A training in a diagnosed model, and a replay of the data with an identified law."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""First-order training through the command: what it leaves behind. `test_ranks` resumes it."""
+"""First-order training through the command: its files. `test_ranks` resumes it."""
 
 import numpy as np
 import torch

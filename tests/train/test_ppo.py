@@ -185,7 +185,7 @@ def test_a_state_that_was_saved_goes_on_the_same():
 
 
 class Reach:
-    """Episodes of one step: an action costs the square of how far it is from what is seen."""
+    """Episodes of one step: an action costs the square of its distance from the observation."""
 
     num_actions = ACTIONS
     sim = SimpleNamespace(capturable=False)
@@ -215,8 +215,8 @@ class Reach:
 
 
 def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], list[float]]:
-    """Mean distances of the trained actor's actions and of the exported ones from what is seen, and
-    each update's target of the divergence.
+    """Mean distances of the trained actor's actions and of the exported ones from the observations,
+    and each update's target of the divergence.
     """
     torch.manual_seed(seed)
     changes = ("environments=64", "steps=8", "hidden=[32,32]", "muon=true", *changes)

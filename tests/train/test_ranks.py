@@ -1,6 +1,4 @@
-"""A training in two processes: one policy, data of their own each, and each goes on
-where it was.
-"""
+"""A training in two processes: one policy, separate data, and both resume."""
 
 import multiprocessing
 import socket
@@ -77,7 +75,7 @@ def process(rank: int, port: int, folder: Path) -> None:
 
 @fixture(scope="module")
 def folder(tmp_path_factory):
-    """What two processes left."""
+    """Files of a training in two processes."""
     folder = tmp_path_factory.mktemp("ranks")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""Training: what a run leaves behind, resuming, interruption, a full disk.
+"""Training: files of a run, resuming, interruption, a full disk.
 
 Tiny networks and batches.
 """

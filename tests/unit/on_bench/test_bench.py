@@ -43,8 +43,8 @@ def test_shipped_records_are_well_formed():
 
 @mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
-    """Its options are taken, its configurations are there and take their changes, its policies are
-    there or made by the line before.
+    """Its options parse, its configurations exist and accept their changes, its policies exist or
+    the line before makes them.
     """
     monkeypatch.setattr(start, "main", lambda parser, run, argv: parser.parse_args(argv))
     record = measurements.load(path)

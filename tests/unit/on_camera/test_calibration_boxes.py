@@ -156,7 +156,7 @@ def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
     ],
 )
 def test_boxes_of_one_lens_give_one_fit(names, tmp_path):
-    """Skew, shear and tangential distortion are too small to be told apart by pixels."""
+    """Skew, shear and tangential distortion are too small to be distinguished by pixels."""
     fits = []
     for name in names:
         path = tmp_path / "calibration"

@@ -1,6 +1,4 @@
-"""The detector on rendered frames and on made-up edges: what is found where, what is refused, and
-what nuisances do.
-"""
+"""The detector on rendered frames and on synthetic edges: positions, refusals, and nuisances."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,6 @@
-"""Ball and goal from frame to frame: a pendulum below a vehicle that throws, seen now and then."""
+"""Ball and goal from frame to frame: a pendulum below a vehicle that throws, detected in some
+frames.
+"""
 
 import math
 
@@ -46,8 +48,8 @@ def throw(frames=40, pitch=0.8, thrust=16.0):
 
 
 def followed(rots, rays, blind, seed=0):
-    """By frame [rad]: angle from the truth of what is read (NaN: not seen) and of what is expected,
-    and within which it is looked for.
+    """By frame [rad]: errors of the detected ball (NaN: none) and of the prediction, and the search
+    radius.
     """
     rng, following = np.random.default_rng(seed), BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
     read, off, within = [], [], []
@@ -100,9 +102,7 @@ def test_what_is_lost_for_long_is_not_visible():
 
 
 def square(rot, place, score, eye=EYE):
-    """A square about a place on the ground as a camera with an attitude, body axes and all, sees it
-    from an eye.
-    """
+    """Rays to a square on the ground, in body axes, from a camera with an attitude at ``eye``."""
     corners = (
         np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]])
         * SIDE
@@ -114,8 +114,8 @@ def square(rot, place, score, eye=EYE):
 
 
 def goals(frames, eyes=None):
-    """Scores of the goals that are told of frames (each of them places and scores of squares) at
-    `PERIOD`; None: missed.
+    """Scores of the goals reported for frames (positions and scores of squares) at `PERIOD`; None:
+    missed.
     """
     rots, _ = throw(len(frames))
     following, scores = BallGoalTracker(RADIUS, SIDE), []
@@ -212,8 +212,8 @@ def toward(angle):
 
 
 def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
-    """A thing 25 deg from where the ball is expected to 7 deg is not it, though it looks likelier;
-    seen in a throw on pictures.
+    """A likelier object 25 deg from the ball's prediction, which is good to 7 deg, is not the ball;
+    observed in a throw on pictures.
     """
     ball_ray, decoy, within = toward(0.0), toward(math.radians(25.0)), math.radians(28.0)
     assert chosen(learnt, [0.4], [ball_ray], Prior()) is None

@@ -156,8 +156,8 @@ def test_target_past_90_degrees_is_visible_and_the_sky_is_not():
 
 
 def test_out_of_view_tells_nothing_but_that():
-    """Wherever a hidden thing is, all that reaches the policy is the same; of a ball cut by the
-    edge no hidden side leaks.
+    """The policy's input does not depend on where a hidden object is; hidden sides of a ball cut by
+    the edge do not leak.
     """
     honest = replace(PARAMS, noise=KeypointNoiseParams(invalid_reads="zero"))
     camera = KeypointCamera(honest, dtype=torch.float64)

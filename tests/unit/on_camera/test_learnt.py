@@ -1,5 +1,5 @@
-"""The learnt detector's geometry, file and calibration; what it finds stands in `visthrow detector
-check`.
+"""The learnt detector's geometry, file and calibration; `visthrow detector check` measures its
+detections.
 """
 
 import math

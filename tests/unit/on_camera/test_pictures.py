@@ -1,4 +1,4 @@
-"""Overlay and straight views: what is drawn lies where the keypoints and the view say."""
+"""Overlay and straight views: drawings lie at the keypoints and in the view's directions."""
 
 import math
 from dataclasses import replace
@@ -20,7 +20,7 @@ CAMERA = KeypointCamera(camera_of(LENS), dtype=torch.float64)
 
 
 def throw_scene():
-    """Keypoints of a vehicle before the throw, and which are seen."""
+    """Keypoints of a vehicle before the throw, and which are visible."""
     pos_w = f64([[0.3, 0.05, 1.3]])
     rot_wb = rotation_from_vector(f64([[0.1, 0.0, 0.2]]))
     points, valid = keypoints(CAMERA, pos_w, rot_wb, f64([[1.4, 0.2]]), f64([[0.45, 0.1, 1.02]]))

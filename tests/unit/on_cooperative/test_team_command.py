@@ -1,4 +1,4 @@
-"""``visthrow cooperative``: the shipped policies throw; bad names are told."""
+"""``visthrow cooperative``: the shipped policies throw; bad names are reported."""
 
 import json
 

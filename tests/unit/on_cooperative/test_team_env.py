@@ -1,4 +1,4 @@
-"""A team's environment: one goal a world, releases that all agree on, ends that all share."""
+"""A team's environment: one goal per world, joint releases, joint ends."""
 
 import math
 from types import SimpleNamespace

@@ -1,6 +1,4 @@
-"""The diagnosis put into a configuration: what is written is what training and the next diagnosis
-read.
-"""
+"""A diagnosis written into a configuration, which training and the next diagnosis read."""
 
 import json
 from dataclasses import replace
@@ -116,8 +114,8 @@ def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_
 
 
 def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refused):
-    """The plant and the overrides that the diagnosis was made with, whatever the shipped one says;
-    of another nothing is written.
+    """The plant and overrides of the diagnosis are written, not the shipped ones; for another plant
+    nothing is written.
     """
     quick, out = tmp_path / "quick.toml", tmp_path / "mended.toml"
     quick.write_text('base = "train/state.toml"\n[release]\nlag = 0.08\n')
@@ -252,9 +250,7 @@ BALL = {
 
 
 def test_other_models_have_extended_setups(diagnosis, tmp_path):
-    """Sizes are counted from there by whoever loads the setup, in the next diagnosis and the next
-    extension, too.
-    """
+    """The next diagnosis and the next extension of the setup count sizes from there, too."""
     out, again = tmp_path / "once.toml", tmp_path / "twice.toml"
     of_ball = diagnosis(**BALL, config="jugglebot")
     assert run_command(f"diagnose apply {of_ball} --out {out}") == 0
@@ -326,8 +322,8 @@ def test_a_broken_covariance_is_refused():
 
 
 def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):
-    """The settings in the header become the block, the delay is as told, and what the block cannot
-    say is named.
+    """The header's settings become the block, the delay is the given one, and unsupported settings
+    are named.
     """
     log, out = tmp_path / "LOG00001.BFL", tmp_path / "firmware.toml"
     header = SETTINGS | {

@@ -1,5 +1,5 @@
-"""Models that do not answer as their derivatives say: candidates are looked at where they lead,
-and windows that the simulation does not follow are left out.
+"""Models that differ from their derivatives: candidates are evaluated by simulation, and windows
+that the simulation does not follow are left out.
 """
 
 from dataclasses import replace
@@ -121,8 +121,8 @@ ROUGH = 1.0
 
 
 class Spoiled(SyntheticModel):
-    """One window moves as nobody can know; with ``beyond`` only where the first effect is larger
-    than that [floors].
+    """One window moves at random; with ``beyond`` only where the first effect is larger than that
+    [floors].
     """
 
     shaken, rough, beyond = True, ROUGH, -1.0

@@ -1,5 +1,5 @@
 """Correlated measurement noise: the algebra against dense covariances, the estimate against planted
-noise, and what it is there for.
+noise, and its effect on verdicts.
 """
 
 from dataclasses import replace
@@ -99,7 +99,7 @@ def test_time_order_and_size_are_those_planted(colour, order):
 
 
 def test_noise_that_is_correlated_is_no_cause(monkeypatch):
-    """Taken for white, it is told as names or as something unknown."""
+    """Taken for white, it yields false names or UNKNOWN."""
     assert diagnose_flights.explain(flown(7, "first")).overall == result.NO_EFFECT
     monkeypatch.setattr(point, "correlations", lambda *_: {})
     assert diagnose_flights.explain(flown(7, "first")).overall != result.NO_EFFECT

@@ -1,5 +1,5 @@
-"""Optimised excitation: it beats what it began with, keeps within the limits, and is flown by every
-vehicle that can fly it.
+"""Optimised excitation: it beats its start, keeps within the limits, and every capable vehicle
+flies it.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ def plant(params):
 
 
 def hovered(params):
-    """A diagnosis of a hover of the setup's vehicle, and what simulates manoeuvres of it."""
+    """A diagnosis of a hover of the setup's vehicle, and the simulator of its manoeuvres."""
     (hover,) = fly_manoeuvres.fly(
         plant(params), [fly_manoeuvres.carried(BASES["hover"], params)], 0
     )
@@ -48,8 +48,8 @@ def quadrotor():
 
 
 def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
-    """Sweeps along all axes at once tell more a second of drag, delay and the map of thrust; an
-    optimiser that returns its start fails.
+    """Sweeps along all axes at once give more information per second on drag, delay and the thrust
+    map; an optimiser that returns its start fails.
     """
     diagnosis, simulate, flown = quadrotor
     aim = plan.PlanningGoal(diagnosis, ABOUT)

@@ -1,4 +1,4 @@
-"""What another flight may differ by, as far as the flights do not say otherwise."""
+"""Spread from flight to flight, as far as the flights allow it."""
 
 import numpy as np
 from numpy.random import default_rng

@@ -1,4 +1,4 @@
-"""What ``visthrow diagnose explain`` does with logs that are copies, or wrong, among others."""
+"""``visthrow diagnose explain`` on logs of which some are copies, or wrong."""
 
 import json
 

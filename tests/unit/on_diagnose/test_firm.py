@@ -1,4 +1,4 @@
-"""Which of the names held-out flights confirm, and what else would explain the flights."""
+"""Confirmation of names by held-out flights, and alternative explanations."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ def promised(nats, came):
             [30.0, 40.0, 35.0],
             [90.0, -60.0, 10.0],
             False,
-        ),  # what three flights say has nothing in common
+        ),  # three flights that do not agree
         ([1.0, 1.2, 1.1], [1.0, 1.2, 1.1], False),  # 3 nats agree by chance as well
         ([200.0, 0.1], [200.0, 0.1], False),  # one flight alone
     ],
@@ -71,7 +71,7 @@ GAIN = result.ChannelGain("pos_w", "m", 0.02, 0.0101, 0.01, float("nan"), 0.5, 0
 
 
 def judged(monkeypatch, truth, same=(), **changes):
-    """A diagnosis whose held-out flights say something else."""
+    """A diagnosis that its held-out flights contradict."""
     plain = held_out.measure
 
     def measure(*args):

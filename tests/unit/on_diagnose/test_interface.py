@@ -1,5 +1,5 @@
-"""Axes, signs and units of commands that a log has otherwise than the simulation: each hidden,
-named, put right.
+"""Axes, signs and units of commands that differ between log and simulation: each is hidden, named,
+corrected.
 """
 
 import json
@@ -107,9 +107,7 @@ def simulated(logs):
 
 @mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])
 def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
-    """A mistake that is there stays put right; one that is suspected without reason is dropped
-    again.
-    """
+    """A real mistake stays corrected; one suspected without reason is dropped again."""
     flights = fly(setting_with({}), free=1, throws=0, seconds=1.0, seed=3)
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
     wrong = [changed(log, both) for log in flights]

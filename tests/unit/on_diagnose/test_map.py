@@ -31,7 +31,8 @@ SETS = {
     "pendulum_single/single_pendulum_id": "pendulum_encoder",
 }
 SLOPE = 0.15
-"""Of a slope that 20 s of an accelerometer with 0.1 m/s^2 of noise tell, averaged over 0.1 s."""
+"""Tolerance of a slope from 20 s of an accelerometer with 0.1 m/s^2 of noise, averaged over 0.1 s.
+"""
 FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b"}
 """Channels whose order or kind the proposal asks about, or that it leaves out."""
 
@@ -338,7 +339,7 @@ def named(stem: str, values: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
-    """Motion capture 37.42 s behind the vehicle's log; rates by gyro and by attitude tell."""
+    """Motion capture 37.42 s behind the vehicle's log; rates by gyro and by attitude show it."""
     columns = flight(20.0)
     whole = log_of(columns)
     onboard = FlightLog(
@@ -373,7 +374,7 @@ of 10 s, 0.38 ms the largest [s].
 def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
     """As `hil` writes its log: rates that it worked out of poses come 6 ms late.
 
-    They neither tell the offset nor stay.
+    They do not set the offset, and are dropped.
     """
     columns = flight(10.0, seed=seed)
     time, rng = columns["time"][::2], np.random.default_rng(seed)

@@ -27,7 +27,7 @@ def likelihood(gram, levels, window):
 
 
 def alone(gram, levels, window):
-    """What a window says by itself."""
+    """Statistics of a single window."""
     levels = replace(levels, share=levels.share[[window]])
     return Integrals([gram], levels).statistics([gram], np.zeros(0))
 

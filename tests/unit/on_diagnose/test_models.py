@@ -1,5 +1,5 @@
-"""The small models against physics of another hand: scipy's integrator, closed forms, and planted
-parameters found again.
+"""The small models against independent physics: scipy's integrator, closed forms, and recovery of
+planted parameters.
 """
 
 import json
@@ -100,9 +100,7 @@ class TestBall:
         assert estimates["side_spin"][0] == approx(0.3, rel=0.05)
 
     def test_wind_shows_where_the_drag_is(self):
-        """Without drag there is no wind: derivatives of the model as it stands say
-        nothing of it.
-        """
+        """Without drag wind has no effect: derivatives of the plain model do not show it."""
         truth, stamps, paths = beside_aeroid.world(240000100)
         positions = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
         diagnosis = explain_without_laws(beside_aeroid.model_of(stamps, positions))
@@ -177,7 +175,7 @@ class TestStand:
 
 class TestFlyer:
     def test_an_attitude_on_another_clock_is_found_in_short_flights(self):
-        """Twelve hundredths of a second, without an accelerometer that tells them before."""
+        """A delay of 0.12 s, without an accelerometer that shows it beforehand."""
         logs = [fly(4.0, late=0.12, seed=seed) for seed in range(3)]
         diagnosis = diagnose_flights.diagnose(logs, FlyerModel(logs, LATE_FLYER), laws=False)
         assert diagnosis.named == ("attitude_delay",)
@@ -427,8 +425,8 @@ class TestImu:
     @staticmethod
     @cache
     def flight(curve: float, inertia: tuple[float, float], seed: int) -> FlightLog:
-        """A vehicle that turns to and fro about all axes while its thrust swings; Euler steps of
-        0.5 ms of the test's own, an accelerometer off by 0.2 m/s^2.
+        """A vehicle that turns to and fro about all axes while its thrust swings; integrated by
+        Euler steps of 0.5 ms, with an accelerometer off by 0.2 m/s^2.
         """
         p, rng, step = IMU, default_rng(seed), 5e-4
         time = np.arange(0.0, 5.0, step)
@@ -501,7 +499,7 @@ class TestImu:
         for log in logs:
             rate = log["rate_b"]
             rate.values[:] += 40.0 * np.sin(4.0 * rate.time)[:, None] * [1.0, -1.0, 0.5]
-        strong = tuple(1.8 * c for c in IMU.thrust_map)  # the weight tells of the map's scale
+        strong = tuple(1.8 * c for c in IMU.thrust_map)  # the weight fixes the map's scale
         model = ImuModel(logs, replace(IMU, thrust_map=strong))
         assert model.channels == ("acc_b",)
         assert "with a correlation of 0." in model.notes[0]

@@ -1,4 +1,4 @@
-"""Recorded data of others: what is said of each, and what is not.
+"""Verdicts on published recorded data.
 
 The reasons stand in docs/explanation/diagnosis_trust.md and the record recorded-data-page.
 

@@ -1,4 +1,4 @@
-"""What a replay takes from a log."""
+"""A replay's inputs from a log."""
 
 import numpy as np
 from numpy.random import default_rng
@@ -15,9 +15,7 @@ SWING = [0.1, 0.2, 0.3]
 
 
 def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> FlightLog:
-    """Ten seconds whose body rates swing at 10 Hz, seen at so many samples a second, none in the
-    gap.
-    """
+    """Ten seconds whose body rates swing at 10 Hz, sampled at ``rate`` [Hz], not in the gap."""
     at, stamps = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
     stamps = stamps[(stamps <= gap[0]) | (stamps >= gap[1])]
     values = np.sin(2.0 * np.pi * 10.0 * stamps)[:, None] * SWING
@@ -32,7 +30,7 @@ def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> 
 
 
 def test_a_gyro_of_1_kHz_is_as_good_in_a_quarter_of_its_samples():
-    """Its noise is halved and white, and the motion that it saw is all there."""
+    """Its noise is halved and white, and the measured motion is kept."""
     log = flight(1000.0, 0.02)
     gyro = record_of(log).gyro
     assert len(gyro.time) == approx(2500, abs=5)

@@ -59,7 +59,7 @@ def found():
 
 
 def test_landings_are_reported_in_millimetres(found, measured):
-    """Before, after with causes sized by the other flights, and by each cause alone; in sentences
+    """Before, after with causes sized by the other flights, and by each cause alone; in the text
     too.
     """
     floors = {e.name: e.floor for e in EFFECTS}
@@ -162,9 +162,7 @@ def test_a_session_holds_what_separates_more_than_what_stands_before_it():
 
 @mark.parametrize(("telling", "repeats"), [(0, 3), (1, 2), (2, 1)])
 def test_a_name_needs_three_flights_that_tell_of_it(telling, repeats):
-    """Held-out flights confirm by what is left when one of them is; two leave an interval without
-    end.
-    """
+    """Confirmation leaves out one held-out flight at a time; two give an unbounded interval."""
     goal = plan.PlanningGoal.__new__(plan.PlanningGoal)
     one = np.ones(1)
     goal.priors = Priors(one, one, -9.0 * one, 9.0 * one, one > 0.0)

@@ -1,5 +1,5 @@
-"""What varies from flight to flight: found where it does, silent where it does not, and handed on
-to training.
+"""Effects that vary from flight to flight: found where they vary, not reported elsewhere, and
+passed to training.
 """
 
 from dataclasses import replace
@@ -91,7 +91,7 @@ def campaign(rng, days, by_day, by_flight):
 
 
 def on_days(rng, *deviations) -> set[str]:
-    """Return who has a share of the release's lag."""
+    """Return the groups with a random share of the release's lag."""
     statistics, days = campaign(rng, 5, *deviations)
     return {c.group for c in chosen_of(statistics, days)[0] if c.name == "lag_jitter"}
 
@@ -129,7 +129,7 @@ def share(j, group, size):
 
 
 def test_a_mean_is_as_certain_as_its_number_of_days():
-    """Three flights of a day tell no more of what all days share than one does."""
+    """Three flights of a day give no more information on the days' common size than one does."""
     statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
     by_flight, by_day = (freed(statistics, share(0, who, 6.0), days) for who in (FLIGHT, DAY))
     assert len(by_day.flights) == 5
@@ -229,7 +229,7 @@ def test_what_single_flights_differ_by_is_integrated_out():
     assert_allclose(integrated, whole, rtol=1e-9)
 
 
-# Less than what flights may differ by, and more.
+# Less than the spread from flight to flight, and more.
 @mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
     sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
@@ -257,16 +257,14 @@ def test_an_effect_that_varies_about_nothing_is_not_named():
 
 
 BENT = 0.1
-"""A release early by a floor tells so much more of itself than its derivative says, and twice as
-much by two.
-"""
+"""Growth of a release's response per floor of earliness, relative to its derivative."""
 TRUTH = 0.012
 """Deviation of the release's lag [s]: 6 floors."""
 INFORMATION = 30.0
 
 
 def answer(lag):
-    """What is seen of a release late by so many floors, per its derivative."""
+    """Response to a release late by some floors, relative to its derivative."""
     return lag + BENT * lag * np.maximum(-lag, 0.0)
 
 

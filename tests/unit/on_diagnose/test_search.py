@@ -1,5 +1,5 @@
-"""The search on flights whose truth is known: names, sizes, classes, events, copies; and that each
-guard is needed.
+"""The search on flights whose truth is known: names, sizes, classes, events, copies; and the need
+for each guard.
 """
 
 from dataclasses import replace
@@ -158,7 +158,7 @@ def test_what_happened_in_one_flight_is_an_event_and_no_cause():
 
 @mark.parametrize(("force", "events"), [(0.006, ()), (0.2, (4,))])
 def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, events):
-    """Where no gust stirs, the noise shows forces that move a body by a millimetre."""
+    """Without gusts, forces that move a body by a millimetre stand out from the noise."""
 
     def stirred(model, window):
         if (window.flight, window.phase) != (4, "throw"):
@@ -192,7 +192,7 @@ def test_flights_that_differ_each_for_itself_leave_nothing_to_vary():
 
 
 def best_set(sizes) -> set[str]:
-    """Return the names of the set that flights ask for, each with its own size of one effect."""
+    """Return the names of the best set for flights, each with its own size of one effect."""
     priors = replace(_priors(1), slab=np.full(1, 20.0))
     information = np.full((len(sizes), 1, 1), 4.0)  # information: half a floor's deviation each
     none = np.zeros(len(sizes))
@@ -404,7 +404,7 @@ def test_a_window_that_no_force_explains_is_left_out():
 
 def test_a_set_that_was_the_best_before_stays_possible():
     model = SyntheticModel(truth={"effect_06": 15.0}, seed=4)
-    for w in model._windows:  # hardly to be told from it
+    for w in model._windows:  # hardly distinguishable from it
         w.effects[:, 8] = w.effects[:, 6] + 0.03 * w.effects[:, 3]
     selector = selector_of(model)
     twin = frozenset(c for c in selector.candidates if c.name == "effect_08")
@@ -438,7 +438,7 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that
     hold it, stay a fifth too small.
 
-    Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
+    Where one flight alone shows it, no held-out flight can confirm it: that is not required here.
     """
     monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
     model = SyntheticModel(throws=1, free=2, law="speed", law_size=0.0, seed=4)

@@ -1,4 +1,4 @@
-"""``visthrow diagnose simulate``: its flights hold what the simulated world hides."""
+"""``visthrow diagnose simulate``: its flights hold the simulated world's hidden effects."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_flights_hold_what_the_world_hides(tmp_path):
 
 
 def test_a_thrown_payload_falls_and_stays_where_it_lands(tmp_path):
-    """It hung in the air where it had left the rope, which no cause explains."""
+    """It used to hang in the air where it had left the rope, which no cause explains."""
     thrown = f"diagnose simulate --set rope.segments=1 --device cpu --out {tmp_path}"
     assert run_command(thrown, "throw at 3 m/s") == 0
     payload = FlightLog.load(tmp_path / "throw_at_3_m_s-0.npz")["payload_pos_w"]
@@ -133,7 +133,7 @@ def test_the_help_lists_what_can_be_flown(capsys):
 
 
 def test_effects_name_manoeuvres_as_the_plan_does():
-    """A report's "rate doublets" can be asked of ``plan --manoeuvres`` and of ``simulate``."""
+    """``plan --manoeuvres`` and ``simulate`` accept a report's "rate doublets"."""
     flyer = load("nanobench_cf21").flyer
     effects = [*catalogue().values(), *random_effects(), *effects_of("flyer", flyer)]
     named = {manoeuvre for effect in effects for manoeuvre in effect.manoeuvres}

@@ -161,8 +161,8 @@ def test_landings_are_predicted_from_before_the_throw(planted):
 
 
 def test_initial_states_follow_the_effects(planted):
-    """A centre of mass elsewhere needs other rotors, integrators and attitudes to begin with, or a
-    transient hides what it does.
+    """A shifted centre of mass needs other initial rotor speeds, integrators and attitudes, or a
+    transient hides its effect.
     """
     model = model_of(planted[0], "com_y")
     nominal, size = linearised(model), np.array([15.0])
@@ -317,8 +317,8 @@ def test_mistakes_are_reported(planted):
 
 
 def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(planted):
-    """Where a controller makes up for no voltage: it carries the weight at the share of throttle,
-    whatever a log begins with.
+    """Without voltage compensation the voltage follows from the hover's share of throttle, not from
+    the log's first sample.
     """
     flight, plant = replace(record_of(planted[0][0]), voltage=None), paper_plant()
     climbing = replace(flight, command=flight.command * [2.0, 1.0, 1.0, 1.0])
@@ -334,7 +334,7 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
 
 
 def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
-    """It was: with nothing hidden, thrust 0.7 % too high was named. The voltage tells."""
+    """It was: with nothing hidden, thrust 0.7 % too high was named. The voltage shows it."""
     names = ["thrust_gain", "air_density", "mass_quad"]
     logs = fly(setting_with({}), used=0.0, throws=0, seconds=2.6)
     assert not explain_without_laws(model_of(logs, *names)).theta
@@ -375,7 +375,8 @@ def test_a_path_comes_down_between_two_points():
 
 
 SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])
-"""Of vehicle and payload alike, as slow gusts bring it: amplitude [m], frequency [Hz], phase [rad].
+"""Sway of vehicle and payload together, as in slow gusts: amplitude [m], frequency [Hz], phase
+[rad].
 """
 RATE_KEPT = 0.2
 """By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if
@@ -384,7 +385,7 @@ no gust is thought possible.
 
 
 def swayed(log: FlightLog) -> FlightLog:
-    """The log with :data:`SWAY` added to what was measured."""
+    """The log with :data:`SWAY` added to its positions."""
     size, rate, phase = SWAY
     moved = {
         name: replace(
@@ -439,7 +440,7 @@ def bend(states) -> np.ndarray:
 
 
 def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():
-    """It would whip, and what whips tells nothing of what is wrong."""
+    """It would whip, and a whip gives no information on the causes."""
     logs = fly(setting_with({"rope_length": -6e-3}), noise=1.0, free=1, throws=0, seconds=3.0)
     model = model_of(logs, "rope_length")
     assert bend(begun(model)).max() < BENDING
@@ -473,7 +474,7 @@ def test_lost_commands_are_found_where_one_window_of_all_shows_them():
 
 
 def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():
-    """By a part of what the wind is worth, for both push steadily; a shifted mass does not."""
+    """By a part of the wind's evidence, for both push steadily; a shifted mass does not."""
     logs = fly(setting_with({"wind_x": 0.3}), seed=3, free=1, throws=0, seconds=2.6)
     names = ["wind_x", "frame_tilt_y", "com_x"]
     model = model_of(logs, *names)

@@ -1,5 +1,5 @@
-"""Traps made of real flights: what is wrong is named, with the right reason, and good flights stay
-free of it; a channel that is empty or in another unit is refused before anything is named.
+"""Traps made of real flights: the fault is named, with the right reason, and good flights stay free
+of it; a channel that is empty or in another unit is refused before anything is named.
 """
 
 from dataclasses import replace

@@ -1,5 +1,5 @@
-"""Laws outside the catalogue: terms with units, found and told from names; tables where no formula
-is asked for.
+"""Laws outside the catalogue: terms with units, found and distinguished from names; tables where no
+formula fits.
 """
 
 from dataclasses import replace
@@ -159,7 +159,7 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
 
 
 class Pushed(SyntheticModel):
-    """A vehicle that something pushes along the vertical."""
+    """A vehicle with an external force along the vertical."""
 
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
         force = np.zeros((2, 3, len(motion["time"])))
@@ -276,7 +276,7 @@ DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
 def beside_a_law(model: SyntheticModel, active: list[int], *active_terms: laws.Term) -> Selector:
-    """A selection that has come to some names and laws."""
+    """A selection that holds some names and laws."""
     point = linearised(model)
     if active_terms:
         (point,) = terms.extended(
@@ -313,7 +313,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
 
 
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
-    """What acts where the law acts may be a part of its form; a force on the payload is none."""
+    """A term on the law's body may be part of its form; a force on the payload is not."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
     at = beside_a_law(
         SyntheticModel(law="speed", law_size=0.02, truth=truth, seed=3),
@@ -325,8 +325,8 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
 
 
 def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
-    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is
-    a force on the vehicle.
+    """A force on the payload and its twin that pushes the vehicle as well: a force on the vehicle
+    distinguishes them.
     """
     model = SyntheticModel(law="speed", law_size=0.02, seed=3)
     for w in model._windows:

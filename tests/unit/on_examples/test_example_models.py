@@ -1,5 +1,5 @@
-"""The models of examples against physics of another hand: scipy's integrator, closed forms, planted
-parameters found again; and on recorded data of others.
+"""The models of examples against independent physics: scipy's integrator, closed forms, recovery of
+planted parameters; and on published recorded data.
 """
 
 import re

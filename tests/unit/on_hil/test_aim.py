@@ -1,6 +1,4 @@
-"""Where a payload is said to land: closed forms, and what is done about releases that
-lead astray.
-"""
+"""Predicted landings: closed forms, and the refusal of releases that miss."""
 
 import math
 
@@ -75,8 +73,8 @@ def test_what_is_held_back_and_when_it_is_given_up():
 
 
 def test_a_policy_that_asks_in_hover_never_releases():
-    """It asks at every tick; the throw ends after the patience, and the vehicle hovers on with its
-    payload.
+    """It requests the release at every tick; the throw ends after the patience, and the vehicle
+    hovers on with its payload.
     """
     runner = Runner(
         params("aim.bound=0.8", "aim.patience=0.3"),
@@ -88,7 +86,7 @@ def test_a_policy_that_asks_in_hover_never_releases():
     assert runner.backend.release_times == []
     assert refusals[-1].time - refusals[0].time == approx(0.28, abs=0.021)
     assert all(d.observation[19] < 0.5 for d in refusals), (
-        "the policy is told of no release: there was none"
+        "the policy must not learn of a release: there was none"
     )
     states = [d.state for d in decisions]
     assert states[decisions.index(refusals[-1]) + 1] == "recover"

@@ -1,5 +1,5 @@
 """The parameter audit: values are requested until the vehicle answers, judged, and written only
-where the operator asked for it; and the book-keeping of the release.
+with the operator's option; and the book-keeping of the release.
 """
 
 from pytest import approx
@@ -29,8 +29,8 @@ GOOD = {"GUID_OPTIONS": 13.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "FIXE
 
 
 def audit(values, write=False):
-    """An audit of a vehicle with these parameters: the audit, what was asked and written, the
-    tables shown.
+    """An audit of a vehicle with these parameters: the audit, its requests and writes, the tables
+    shown.
     """
     values, requests, written, tables = dict(values), [], [], []
     box = []
@@ -57,7 +57,7 @@ def test_a_parameter_that_does_not_come_is_a_mismatch():
     found, requests, _, tables, now = audit(values)
     assert found.problems == ["ATC_ANGLE_BOOST did not come; expected 0"]
     assert GIVE_UP < now < GIVE_UP + 0.1
-    assert 20 <= requests.count("ATC_ANGLE_BOOST") <= 27, "asked again and again"
+    assert 20 <= requests.count("ATC_ANGLE_BOOST") <= 27, "requested repeatedly"
     assert "no answer" in tables[0]
 
 
@@ -97,7 +97,7 @@ def test_an_optional_parameter_that_nobody_answers_is_soon_given_up():
 
 
 def sends(release, until, start=0.0):
-    """Times at which it is to be sent."""
+    """Times at which the release is to be sent."""
     out, now = [], start
     while now < until:
         if release.due(now):

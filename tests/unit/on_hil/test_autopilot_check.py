@@ -1,4 +1,4 @@
-"""What a recorded run says of its hover."""
+"""The check of a recorded run's hover."""
 
 import shutil
 from types import SimpleNamespace

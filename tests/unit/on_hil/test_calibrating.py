@@ -64,7 +64,7 @@ class Hall:
         runner.backend.release = self.release
 
     def detection(self, now: float) -> Detection:
-        """What the camera saw when it did."""
+        """The camera's image at the time of exposure."""
         _, state = min(self.path, key=lambda row: abs(row[0] - (now - self.late)))
         rot = rotation_from_quat(torch.tensor(state["quat_wb"][None]).double())[0].numpy()
         eye = state["pos_w"] + rot @ self.camera.position_b.numpy()
@@ -134,9 +134,7 @@ class Hall:
                 self.command = np.array(decision.command)
 
     def off(self) -> float:
-        """RMS of what the policy would be shown now from what the camera of training
-        would see [-].
-        """
+        """RMS of the policy's present keypoints from those of the training's camera [-]."""
         _, state = min(self.path, key=lambda row: abs(row[0] - (self.plant.time - 0.01)))
         tensors = [
             torch.tensor(state[name][None]).double()

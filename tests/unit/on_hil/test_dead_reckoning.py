@@ -28,7 +28,7 @@ def carried(ticks=10, rates=lambda n: None, command=STILL) -> DeadReckoning:
 
 @mark.parametrize("axis", [0, 1, 2])
 def test_reported_rates_turn_the_attitude(axis):
-    """From the time of the pose on; reports are told apart by a last digit."""
+    """From the time of the pose on; reports differ in a last digit."""
     rates = lambda n: tuple(3.0 + 1e-9 * n if i == axis else 0.0 for i in range(3))  # noqa: E731
     reckoning = carried(rates=rates)
     angle = 2.0 * math.atan2(reckoning.state.quat[axis], reckoning.state.quat[3])

@@ -1,4 +1,4 @@
-"""The table of what firmwares do: each row names its source."""
+"""The table of firmware facts: each row names its source."""
 
 import re
 
@@ -11,7 +11,7 @@ FIRMWARES = sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def incomplete(fact: Fact) -> bool:
-    """Whether a row does not say where its value was read."""
+    """Whether a row lacks the source of its value."""
     words = (fact.text, fact.means, fact.version, fact.repository)
     return not re.fullmatch(r"[\w./-]+:[1-9]\d*", fact.at) or not all(map(str.strip, words))
 

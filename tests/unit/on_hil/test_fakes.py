@@ -1,4 +1,4 @@
-"""The parts of the fakes: the witness catches what it is there for, options are checked."""
+"""The parts of the fakes: the witness catches breaches, options are checked."""
 
 import math
 

@@ -28,7 +28,7 @@ from tests.hil_runs import copy_run, record_run, saved_policy
 
 LAG = 0.11
 CLOCK = 3e-3
-"""Of a time that is found in poses of a tenth of a millimetre of noise [s]."""
+"""Tolerance of a time found in poses with a tenth of a millimetre of noise [s]."""
 
 
 @fixture(scope="module")
@@ -120,7 +120,7 @@ def test_the_end_of_a_run_writes_logs_and_pictures(run):
 
 
 def test_the_log_says_where_nothing_real_flew(run, logs, tmp_path):
-    """A run at `visthrow hil fake` is not taken for one of a vehicle."""
+    """A run at `visthrow hil fake` must not count as one of a vehicle."""
     assert logs[0].meta["plant_meaning"] == "poses of mavlink, back-end dry-run"
     shutil.copytree(run[0], tmp_path / "a")
     path = tmp_path / "a" / "summary.json"
@@ -169,8 +169,8 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
 
 
 def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
-    """Let go at 0.11 s from 1.1 m at 4 m/s; it is seen until 60 ms, or 250 ms, before it comes
-    down.
+    """Released at 0.11 s from 1.1 m at 4 m/s; it is tracked until 60 ms, or 250 ms, before it
+    lands.
     """
     fall = math.sqrt(2 * (1.1 - 0.04) / 9.81)
     for before, found in ((0.06, True), (0.25, False)):

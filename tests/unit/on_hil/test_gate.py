@@ -1,6 +1,4 @@
-"""The gate, the track and the clock: what is refused, what goes stale and when, and what a step of
-a clock does.
-"""
+"""The gate, the track and the clock: refusals, staleness, and steps of a clock."""
 
 import math
 from dataclasses import replace
@@ -147,7 +145,7 @@ def test_staleness_is_of_content_not_of_arrival():
 
 @mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
 def test_a_single_marker_is_a_position(quat):
-    """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
+    """The vehicle's attitude is needed, a ball's is not. An untracked body gives no pose."""
     for turns, reason in ((True, "quaternion"), (False, None)):
         reason = "attitude" if turns and math.isnan(sum(quat)) else reason
         for offset in ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0)):  # which an attitude turns

@@ -34,9 +34,7 @@ def about(axis, angle):
 
 
 def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
-    """What a source with these frames says of a vehicle that is carried about, not
-    quite straight.
-    """
+    """Poses of a source with these frames, of a vehicle carried about, not quite straight."""
     rng = default_rng(seed)
     pos, quat, track = np.array([0.3, -0.2, 1.0]), about(2, math.radians(rng.uniform(-5, 5))), []
     ways = {i: 0.5 * np.eye(3)[i] + rng.normal(0, 0.05, 3) for i in range(3)}

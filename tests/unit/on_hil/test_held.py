@@ -9,7 +9,7 @@ from visthrow.common.errors import ConfigError
 
 
 class SpyBackend(DryRun):
-    """Keeps what it is sent, and when."""
+    """Keeps sent commands with their times."""
 
     def __init__(self):
         super().__init__()
@@ -24,8 +24,8 @@ class SpyBackend(DryRun):
 
 
 def test_each_command_goes_out_so_much_later_and_none_is_lost():
-    """Ticks every 20 ms, a wait of 25.5 ms: two commands wait at a time; a release of the
-    back-end's own is served when it is due.
+    """Ticks every 20 ms, a wait of 25.5 ms: two commands wait at a time; a release that the
+    back-end scheduled is served when it is due.
     """
     spy = SpyBackend()
     held = Held(spy, 0.0255)

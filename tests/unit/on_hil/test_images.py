@@ -1,5 +1,5 @@
-"""Pictures as a source of keypoints: a rendered flight looked at by the detector and flown by the
-runner, live and recorded.
+"""Pictures as a source of keypoints: the runner flies on detections in a rendered flight, live and
+recorded.
 """
 
 import json
@@ -74,7 +74,7 @@ def pictures():
 
 
 class Blind(Detector):
-    """A detector of somebody else's: it reports a ball on the axis, whatever it is shown."""
+    """A user's detector that reports a ball on the axis in every image."""
 
     def detect(self, image, prior=None):
         self.check(image)
@@ -92,7 +92,7 @@ def test_a_custom_detector_is_named_by_the_configuration(pictures, monkeypatch):
 
 
 class Known(Blind):
-    """It reports a ball and a square in its own camera, whatever it is shown."""
+    """A detector that reports the same ball and square of its camera in every image."""
 
     corners = np.array(
         [[0.1, 0.1, 1.0], [0.1, -0.1, 1.0], [-0.1, -0.1, 1.0], [-0.1, 0.1, 1.0]]

@@ -196,7 +196,7 @@ def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
     heard, answers = [], []
     ours.listen(lambda message, arrival: heard.append((message.get_type(), arrival)))
     peer.listen(lambda message, arrival: answers.append(message.get_type()))
-    assert not ours.send(MESSAGES[3]), "nobody has spoken yet"
+    assert not ours.send(MESSAGES[3]), "no peer is known yet"
     assert peer.send(MESSAGES[0])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         ours.pump(lambda: 1.5)

@@ -1,4 +1,4 @@
-"""Real-time priority and locked memory: asked for only where wanted, and refusals are said."""
+"""Real-time priority and locked memory: requested only where configured; refusals are reported."""
 
 import ctypes
 import os

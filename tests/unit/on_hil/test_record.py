@@ -127,7 +127,7 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
         "fake_betaflight",
         "--set",
         "betaflight.device=tcp:127.0.0.1:9",
-    ]  # nobody listens there
+    ]  # no listener
     refused(f"hil run --out {tmp_path}/new --set {device}", *late, message="cannot connect")
     assert not (tmp_path / "new").exists()
 

@@ -1,5 +1,5 @@
-"""The signs of body rates by poses or by reported rates alone: what the first hover says of
-vehicles that answer fast or slowly, and drift meanwhile.
+"""The signs of body rates by poses or by reported rates alone: verdicts of the first hover on
+vehicles that respond fast or slowly, and drift meanwhile.
 """
 
 from types import SimpleNamespace
@@ -10,13 +10,13 @@ from pytest import mark
 from hil.control.response import ANGLE_NOISE, Response
 
 PERIOD, MASS, PROBE = 0.02, 0.272, 0.3
-DRIFT = 0.05  # deviation of a steady turn that nobody commanded [rad/s]
+DRIFT = 0.05  # deviation of a steady uncommanded turn [rad/s]
 FLIGHTS = 10
 
 
 def verdict(sign: float, lag: float, delay: int, reported: bool, rng: np.random.Generator) -> str:
     """Hover until a verdict; ``lag`` [s] and ``delay`` [ticks] of a vehicle's rates, which have a
-    sign, 0 for none. Where they are reported, its poses do not turn: nothing else can tell.
+    sign, 0 for none. Where they are reported, its poses do not turn: only the reports show them.
     """
     response = Response(PERIOD, MASS, 0.3, PROBE)
     commands = [(0.0, 0.0, 0.0)] * (delay + 1)

@@ -1,5 +1,5 @@
-"""Who may speak on a link: ids, type of autopilot, addresses that are held in flight; what is
-refused is counted and said.
+"""Parties of a link: ids, type of autopilot, addresses that are fixed in flight; refusals are
+counted and reported.
 """
 
 from pytest import mark, raises
@@ -30,7 +30,7 @@ def roster(*parties, **more):
 
 
 def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
-    """A bridge of the motion capture that uses the vehicle's own ids, beside the vehicle."""
+    """A bridge of the motion capture that uses the vehicle's ids, beside the vehicle."""
     who, messages = roster()
     assert who.admit(pose(), A, 0.0)
     assert who.admit(beat(), B, 0.1)
@@ -151,7 +151,7 @@ def test_a_fake_says_that_it_is_one():
     assert not who.admit(word, A, 0.0)
     assert not who.simulated
     who.admit(pose(), A, 0.0)
-    assert not who.admit(word, B, 0.0), "nobody says it for another one"
+    assert not who.admit(word, B, 0.0), "no party may send it for another one"
     assert not who.simulated
     who.admit(word, A, 0.1)
     assert who.simulated

@@ -1,6 +1,4 @@
-"""The runner on a vehicle of a few lines: a throw, and every fault with what was done
-and how soon.
-"""
+"""The runner on a vehicle of a few lines: a throw, and every fault with the reaction and delay."""
 
 import math
 from dataclasses import replace
@@ -27,8 +25,8 @@ def runner(action=AT_ONCE, *overrides, mechanism=0.0, **kwargs) -> Runner:
 
 
 def safe(pilot: Runner, decisions) -> None:
-    """What must hold whatever happened: finite, clipped commands, and at most one release, and that
-    in a throw.
+    """Invariants of every run: finite, clipped commands, and at most one release, and that in a
+    throw.
     """
     for _, command in pilot.backend.sent:
         assert all(map(math.isfinite, command))
@@ -219,7 +217,7 @@ def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_visible(x):
 
 
 def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
-    """Nobody told the runner; the vehicle, rid of it, goes its own way, and is followed.
+    """The runner gets no report of it; the vehicle, without the load, drifts away, and is followed.
 
     The throw is over.
     """
@@ -239,7 +237,9 @@ def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
 
 @mark.parametrize("name", ["ball", "goal"])
 def test_no_throw_on_pictures_that_do_not_show(name):
-    """Seen in the hover and then lost, it goes back to ready; seen again, it throws."""
+    """Detected in the hover and then lost, the goal sends the runner back to ready; detected again,
+    it throws.
+    """
     hidden = (1.6, 2.6)
     ahead = np.array([[-0.1, -0.8, 0.7], [0.1, -0.8, 0.7], [0.1, -0.6, 0.7], [-0.1, -0.6, 0.7]])
     corners = tuple(map(tuple, (ahead / np.linalg.norm(ahead, axis=1, keepdims=True)).tolist()))
@@ -272,7 +272,7 @@ def broken_policy(pilot: Runner, act):
 
 
 def not_finite(pilot: Runner, value: float):
-    """A policy's step whose command is no number, and which asks for the release."""
+    """A policy's step whose command is no number, and which requests the release."""
     act = pilot.pilot.act
 
     def broken(*args):
@@ -362,7 +362,7 @@ def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     ("sends", "ended"), [(True, ["check", "ready", "abort"]), (False, ["check", "ready"])]
 )
 def test_a_fence_that_others_leave_ends_no_run_that_looks_on(sends, ended):
-    """A recorded throw brakes below the floor: whoever only looks on flies nothing there.
+    """A recorded throw brakes below the floor: the observing runner flies nothing.
 
     A vehicle of ours comes down.
     """
@@ -392,7 +392,7 @@ def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
 
 
 def test_a_release_outside_of_the_fence_is_refused():
-    """The payload hangs outside of its own fence from the moment that the policy asks."""
+    """The payload hangs outside of its fence from the policy's release request on."""
     pilot = runner(AT_ONCE)
     decisions = fly(pilot, 5.0, watch=narrowed(pilot, "armed", {"payload_low": (-3.0, -3.0, 1.2)}))
     safe(pilot, decisions)
@@ -400,7 +400,7 @@ def test_a_release_outside_of_the_fence_is_refused():
 
 
 class HoldingSpy(Spy):
-    """An autopilot that holds and lands by itself, and keeps when it was asked to."""
+    """An autopilot that holds and lands by itself, and records the times of requests."""
 
     holds = True
 

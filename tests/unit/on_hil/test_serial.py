@@ -1,4 +1,4 @@
-"""MSP on a serial port (a pseudo-terminal), and what is written down of it."""
+"""MSP on a serial port (a pseudo-terminal), and its recording."""
 
 import os
 import sys

@@ -1,5 +1,5 @@
-"""MAVLink signing: keys, what is taken and what is not; pymavlink's own check is the oracle for
-what we send.
+"""MAVLink signing: keys, accepted and refused messages; pymavlink's check is the oracle for what we
+send.
 """
 
 import hashlib

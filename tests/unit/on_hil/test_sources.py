@@ -1,5 +1,5 @@
-"""Sources: senders told apart, pairs, .tlog and CSV read as the live link does, wrong
-files told.
+"""Sources: senders distinguished, pairs, .tlog and CSV read as the live link does, wrong files
+reported.
 """
 
 import math
@@ -70,7 +70,7 @@ def test_a_local_position_takes_the_attitude_of_its_sender():
 
 
 def test_a_local_position_takes_angles_as_well():
-    """ArduPilot streams ATTITUDE, and ATTITUDE_QUATERNION only where it is asked to."""
+    """ArduPilot streams ATTITUDE, and ATTITUDE_QUATERNION only on request."""
     decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
     decoder.feed(
         wired(mav.MAVLink_attitude_message(990, 0.0, 0.0, math.pi / 2, 0.1, 0.2, 0.3)), 0.0

@@ -132,7 +132,7 @@ def test_a_peer_that_asks_is_answered_with_our_time():
     peer.pump(lambda: 0.0)
     answers = [m for m in heard if m.ts1 == 777]
     assert [m.tc1 for m in answers] == [12_500_000_000]
-    # An answer that nobody asked for, and one to an old question, set no clock.
+    # An unrequested answer, and one to an old request, set no clock.
     peer.send(mav.MAVLink_timesync_message(5, 42))
     ours.pump(lambda: 13.0)
     assert not ours.sync.peers

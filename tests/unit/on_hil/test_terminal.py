@@ -1,5 +1,5 @@
-"""The operator's terminal: lines, half lines, what is no text, signals; and a console that holds
-nobody up.
+"""The operator's terminal: lines, half lines, bytes that are no text, signals; and a console that
+never blocks.
 """
 
 import os
@@ -55,7 +55,7 @@ def test_signals_that_would_end_the_process_say_abort(typed, number):
     assert signal.Signals(number).name in words.why or "Ctrl-C" in words.why
     assert terminal.words("abort") == words, "it stays said"
     if number != signal.SIGINT:
-        os.kill(os.getpid(), number)  # systemd says it again; nothing raises
+        os.kill(os.getpid(), number)  # systemd repeats it; nothing raises
         assert terminal.words("abort") == words
 
 

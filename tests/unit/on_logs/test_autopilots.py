@@ -1,4 +1,4 @@
-"""What an autopilot's log says of itself: validity, vehicle, motors, speeds, clocks, damage."""
+"""An autopilot log's metadata: validity, vehicle, motors, speeds, clocks, damage."""
 
 import math
 import struct
@@ -214,7 +214,7 @@ def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_f
 
 
 def test_a_ground_stations_heartbeat_is_not_the_vehicles(tmp_path):
-    """The station is heard first, and is not armed."""
+    """The station's messages come first, and it is not armed."""
     path, station = (
         write_tlog(tmp_path / "a.tlog", lambda mav, i: []),
         dialect.MAVLink(None, 255, 0),

@@ -1,6 +1,4 @@
-"""`visthrow diagnose check`: a flight made of closed forms, and everything that can be wrong with
-its log.
-"""
+"""`visthrow diagnose check`: a flight of closed forms, and every fault of its log."""
 
 import json
 import re
@@ -143,7 +141,7 @@ def test_wrong_axes(channel, order, signs):
     columns[channel] = columns[channel][:, order] * signs
     found = faults(log_of(columns))
     if channel == "acc_b" and order == (1, 0, 2):
-        return  # gravity alone does not tell x from y
+        return  # gravity alone does not distinguish x from y
     assert "frames" in found, found
     assert channel in found
 
@@ -190,7 +188,7 @@ def test_scrambled_commands_are_caught():
 
 
 def test_a_hover_and_a_force_that_no_model_has_refuse_no_log():
-    """Thrust that hardly varies says nothing of its clock; inflow is no delay."""
+    """Thrust that hardly varies does not show its clock; inflow is no delay."""
     assert not faults(log_of(flight(20.0, scale=0.02)))
     columns = flight(20.0)
     level = (columns["vel_w"][:, :2] ** 2).sum(1)
@@ -227,7 +225,7 @@ def test_a_late_channel_that_no_model_reads_refuses_no_log():
 
 
 def test_a_late_attitude_refuses_a_log_by_the_velocity_that_follows_its_position():
-    """No model reads the velocity, which alone is exact enough to tell the clocks apart."""
+    """No model reads the velocity, which alone is exact enough to distinguish the clocks."""
     logs = []
     for seed, late in ((1, 0.0), (2, 0.1)):
         columns = flight(20.0, seed=seed)
@@ -652,7 +650,7 @@ def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
 
 
 def test_delays_of_pieces_that_noise_hides_are_no_drift():
-    """A slow motion goes together with itself, but each piece tells its delay to 50 ms at best."""
+    """Pieces of a slow motion agree, but each measures its delay to 50 ms at best."""
     rng, time = default_rng(0), np.arange(0.0, 40.0, 0.01)
     pos = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
     noisy = [pos + rng.normal(0.0, 0.3, pos.shape) * [1.0, 1.0, 0.0] for _ in range(2)]

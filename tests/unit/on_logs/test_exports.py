@@ -127,7 +127,7 @@ EXPORTS = {
 
 @pytest.fixture
 def proposed(tmp_path):
-    """Function that writes a file; returns its table, what is proposed for it, and its logs."""
+    """Function that writes a file; returns its table, the proposed mapping, and its logs."""
 
     def take(text, name="a.csv"):
         path = tmp_path / name
@@ -238,7 +238,7 @@ KINDS = {"Rotation": "deg", "Position": "m"}
 
 
 def test_angles_in_degrees_are_no_position(proposed):
-    """Euler angles of an order that no name tells are left out and listed."""
+    """Euler angles whose order no name gives are left out and listed."""
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
     _, found, _ = proposed(table_with(",".join(names), angles, POS))

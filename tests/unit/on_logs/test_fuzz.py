@@ -1,5 +1,5 @@
-"""Damaged log files of every format: a flight log that can be looked at, or an error that says
-what; nothing else, and soon.
+"""Damaged log files of every format: a readable flight log, or an error that names the damage;
+nothing else, and soon.
 """
 
 import gzip

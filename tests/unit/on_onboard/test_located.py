@@ -1,5 +1,5 @@
-"""Where keypoints lie: the truth without noise, one wrong point outvoted, nothing where nothing is
-seen, the goal kept in mind.
+"""Located keypoints: the truth without noise, one wrong point outvoted, no estimate without points,
+the goal remembered.
 """
 
 from dataclasses import replace
@@ -72,7 +72,7 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     )
     assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
     assert (blind[:, 5] == 1.0).all()
-    assert counts[:, :4].all(), "corners read where the goal would be seen"
+    assert counts[:, :4].all(), "corners read where the goal would appear"
     assert not counts[:, 4:].any(), "the payload does not"
     assert_close(shown[:, 15:23], frame[:, 15:23], rtol=0, atol=0.02)
 
@@ -81,7 +81,9 @@ def test_a_goal_that_moves_is_where_it_is_now():
     layout, camera, frame, valid, offset, _ = scene()
     layout = replace(layout, motion=2)
     speed = torch.tensor([0.5, -0.3])
-    frames = frame.repeat(60, 1, 1)  # the vehicle moves with the goal: what it sees stays as it is
+    frames = frame.repeat(
+        60, 1, 1
+    )  # the vehicle moves with the goal: its observations do not change
     frames[:, :, :2] += 0.02 * torch.arange(60.0)[:, None, None] * speed
     *_, (_, velocity, found, _, _) = followed(layout, frames, valid, camera)
     assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)

@@ -1,5 +1,5 @@
 """The order of every number of an observation, by hand: training and flight share the code, so
-neither notices an exchange.
+neither would detect an exchange.
 """
 
 import torch

@@ -1,5 +1,5 @@
-"""What a policy sees after steps that were late or missing: a history of steps a period apart, as
-in training.
+"""Observations after steps that were late or missing: a history of steps a period apart, as in
+training.
 """
 
 import numpy as np
@@ -87,4 +87,4 @@ def test_a_release_that_was_not_done_is_not_reported():
     assert pilot.previous_action[0].tolist() == approx([-0.1, 0.3, 0.0, 0.0, before])
     observe(pilot, PERIOD, PERIOD)
     pilot.cancel_release()
-    assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"
+    assert pilot.previous_action[0, 4] == before, "nor when it is requested again"

@@ -1,4 +1,4 @@
-"""What one vehicle's camera sees on arrays is what the batched projection sees."""
+"""One vehicle's keypoints on arrays equal those of the batched projection."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A policy on arrays of one row decides what the policy decides on tensors."""
+"""A policy on arrays of one row acts as the policy on tensors does."""
 
 from dataclasses import replace
 from itertools import pairwise

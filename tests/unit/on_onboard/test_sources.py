@@ -1,4 +1,4 @@
-"""What tells a vision policy of goal and payload: keypoints and their validity bits alone, as the
+"""A vision policy's inputs on goal and payload: keypoints and their validity bits alone, as the
 camera reports them.
 """
 

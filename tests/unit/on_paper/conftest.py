@@ -1,4 +1,4 @@
-"""What the tests of the baseline share."""
+"""Fixtures of the baseline's tests."""
 
 from unittest import mock
 

@@ -1,4 +1,4 @@
-"""Results that nobody flew, with known means, for tests of the report."""
+"""Synthetic results with known means, for tests of the report."""
 
 import numpy as np
 
@@ -49,14 +49,14 @@ def policy(
     offset=(0.0, 0.0),
     **how,
 ) -> Result:
-    """Throws of a policy that is not there."""
+    """Throws of a policy that does not exist."""
     count, duration = how.pop("count", 60), how.pop("duration", 1.05)
     unit = results.policy_unit(name, "0" * 16, layout, plant, target, count, **how)
     return Result(unit, columns(rng, target, count, spread, offset, duration), MADE)
 
 
 def shipped() -> ResultSet:
-    """A book with throws of the shipped policies, and with what somebody wrote beside them."""
+    """A book with throws of the shipped policies, and with unrelated entries."""
     rng = np.random.default_rng(0)
     thrown = [
         policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024)

@@ -24,7 +24,7 @@ def test_compare_shows_the_baseline_under_each_condition(tmp_path, capsys, one_s
     ]
     printed = capsys.readouterr().out
     (line,) = [line for line in printed.splitlines() if title in line]
-    assert "0.127 ± 0.019" in line, "the paper's TO+MPC stands beside our own-model row"
+    assert "0.127 ± 0.019" in line, "the paper's TO+MPC stands beside the baseline's row"
     assert sum("0.127 ± 0.019" in line for line in printed.splitlines()) == 1, "and beside no other"
     assert next(row for row in rows if row["policy"] == title)["error_mean"] < 0.05
     assert (tmp_path / "compare-hybrid.csv").read_text().count("TO+MPC") == 4

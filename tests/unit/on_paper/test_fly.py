@@ -1,5 +1,5 @@
-"""The baseline in flight: controller against closed forms, throws in its own model and on the
-plants, front and command.
+"""The baseline in flight: controller against closed forms, throws in its model and on the plants,
+front and command.
 """
 
 from dataclasses import replace
@@ -26,7 +26,8 @@ from visthrow.throws import results
 importorskip("piqp")
 
 MODEL_ERROR = 0.05
-"""Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027.
+"""Landing error in the baseline's model from random starts [m] (measured 0.01): the paper's best is
+0.027.
 """
 
 
@@ -134,7 +135,7 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, one_start):
     command = f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}"
     assert run_command(command) == 0
     text = (tmp_path / "report.md").read_text()
-    assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside the own model"
+    assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside our model"
     assert "learnt state policy, training simulator" in text
     units = [result.unit for result in results.load(packed)]
     assert sorted((u["kind"], u["plant"], u["throws"], u["target"]) for u in units) == [

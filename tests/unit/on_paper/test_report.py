@@ -1,5 +1,5 @@
-"""The report: questions to the book, statistics in its tables, what it says where something is
-missing, and the page.
+"""The report: queries of the book, statistics in its tables, messages for missing results, and the
+page.
 """
 
 import re
@@ -95,7 +95,7 @@ def test_sight_that_doubles_the_error_has_a_ratio_of_two():
 
 
 def test_ablation_ratio_bias_and_the_verdict():
-    """Twice the spread is twice the error; a shift along the throw is told as overshoot; equal
+    """Twice the spread is twice the error; a shift along the throw is reported as overshoot; equal
     spread as no effect.
     """
     rng = default_rng(2)
@@ -171,7 +171,7 @@ def test_what_the_report_stands_on_is_stated_once():
 
 
 def test_pictures_show_what_they_are_given():
-    """Of other numbers another picture is drawn."""
+    """Other numbers give another picture."""
 
     def drawn(scale: float) -> list[bytes]:
         size = Interval(scale, 0.9 * scale, 1.1 * scale)

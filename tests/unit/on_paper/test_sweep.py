@@ -1,6 +1,4 @@
-"""Sweeps: what counts as the same run, what is done, who works on what, and what is written down of
-it.
-"""
+"""Sweeps: identity of runs, finished work, distribution of work, and records."""
 
 import json
 import math
@@ -125,8 +123,8 @@ def test_departures_are_what_differs_from_the_training(path, tmp_path):
 
 
 class FakeStarter:
-    """Starts nothing: a task is done by leaving its files, fails, or is busy for a
-    while, as told.
+    """A starter without processes: a task writes its files, fails, or is busy for a while, as
+    configured.
     """
 
     def __init__(self, work, out, devices, jobs, fails=(), busy=()):
@@ -394,7 +392,7 @@ def test_shipped_lists_name_what_exists():
 
 
 def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused):
-    """A stand-in for sbatch keeps the script that it is given; without one, that is said."""
+    """A stand-in for sbatch keeps its script; without sbatch an error says so."""
     importorskip("submitit")
     from visthrow.paper.sweep.cluster import Cluster
 

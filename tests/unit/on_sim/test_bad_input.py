@@ -1,4 +1,4 @@
-"""What the simulators refuse, and that the message names what came, what was expected and where."""
+"""Refused inputs of the simulators; the message names what came, what was expected and where."""
 
 from dataclasses import MISSING, fields, replace
 
@@ -78,7 +78,7 @@ REFUSED = {
     ),
     "precision": (lambda: types("double"), "expected 'float32' or 'float64'"),
 }
-"""What a call is told."""
+"""The message of a refused call."""
 
 
 @mark.parametrize("name", REFUSED)

@@ -1,5 +1,5 @@
-"""Laws as blocks: the kernel's factors are the grammar's, by name and by value; a law pushes as it
-says.
+"""Laws as blocks: the kernel's factors are the grammar's, by name and by value; a law's force is
+its formula's.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ SWIRL = LawParams("payload force", (), "vertical_cross_vel", 0.02)
 
 
 def knots(seed: int = 0) -> dict[str, np.ndarray]:
-    """One moment of a flight, as windows tell it; two knots, for slopes."""
+    """One moment of a flight in a window's quantities; two knots, for slopes."""
     rng = np.random.default_rng(seed)
     quat, cable = rng.normal(size=4), rng.normal(size=3)
     value = {
@@ -42,9 +42,7 @@ def knots(seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def kernels_factors():
-    """The kernel's own factors at the moment that they see: scalars by name, vectors by block and
-    name.
-    """
+    """The kernel's factors at that moment: scalars by name, vectors by block and name."""
     t = types("float64")
     Around = make_struct("Around", {name: getattr(t, kind) for name, kind in laws.AROUND.items()})
     k = knots()

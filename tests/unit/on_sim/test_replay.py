@@ -62,8 +62,8 @@ def flight():
 
 
 def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIODS, **lane):
-    """Replay the flight in some lanes; returns the vectors seen by group, each (stamps, lanes, 3),
-    and all there is.
+    """Replay the flight in some lanes; returns the recorded vectors by group, each (stamps, lanes,
+    3), and all outputs.
     """
     start, times, commands, recorded = flight
     stamps = 0.02 * (1 + np.arange(PERIODS)) if stamps is None else stamps

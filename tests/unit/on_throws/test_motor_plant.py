@@ -1,4 +1,4 @@
-"""The vehicle that a firmware flies: its stand, its rotors, what its sensors show."""
+"""The vehicle that a firmware flies: its stand, its rotors, its sensors."""
 
 import numpy as np
 from pytest import approx, fixture, mark

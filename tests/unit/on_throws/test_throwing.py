@@ -41,7 +41,7 @@ JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt,
 
 
 def dropping_policy(name: str = "state", release: float = 1.0, overrides=()) -> Policy:
-    """A policy that hovers with fixed thrust and asks for the release at once."""
+    """A policy that hovers with fixed thrust and requests the release at once."""
     experiment = load_experiment(name, overrides)
     contract = contract_of(experiment)
     weight = GRAVITY * plant_of(experiment).total_mass
@@ -136,7 +136,7 @@ MEASURED_VECTORS = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
 
 
 def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
-    """A vehicle that is told not to turn turns as fast as its bias says."""
+    """Under a command of zero rates a vehicle turns at its bias."""
     experiment = load_experiment("state")
     quiet = replace(experiment.task.noise, command_bias=0.0, command_step=0.0)
     weight = GRAVITY * plant_of(experiment).total_mass
@@ -200,7 +200,7 @@ def test_a_flight_goes_from_hover_to_hover(flown):
     assert times["landing"] - times["separation"] == approx(fall, abs=0.05), (
         "it is dropped, nearly at rest"
     )
-    of_others = {"flying", "neighbour_pos_w"}  # an autopilot says it, or another vehicle's log
+    of_others = {"flying", "neighbour_pos_w"}  # from an autopilot, or another vehicle's log
     assert set(STANDARD_CHANNELS) - of_others <= set(flown.channels)
     assert "measured_pos_w" in flown
 

@@ -1,5 +1,5 @@
-"""What ThrowEnv adds to a perfect simulation: noise, bias and latency by their statistics, and the
-reward of a crash worked by hand.
+"""Additions of ThrowEnv to a perfect simulation: noise, bias and latency by their statistics, and
+the reward of a crash worked by hand.
 """
 
 import math

@@ -50,7 +50,7 @@ pytestmark = mark.usefixtures("one_thread")
 
 
 def first_order(name="state", *changes, reaction=5.0):
-    """A first-order training of a small network that has been made to react to what it sees."""
+    """A first-order training of a small network that reacts to its observations."""
     found = Trainer(load_experiment(name, [*SMALL, *changes]), "cpu", 3).algorithm
     with torch.no_grad():
         found.network.mlp[-1].weight.mul_(reaction)
@@ -130,7 +130,7 @@ DRAGGED = ["vehicle.aero.drag_x=0.6", "vehicle.aero.drag_y=0.6", "vehicle.aero.d
     ids=["own", "closed loop", "slower", "dragged", "x500"],
 )
 def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, yaw, monkeypatch):
-    """How a flight ends, and what is seen of that, against commands at earlier steps, by
+    """Derivatives of a flight's end, and of its observation, by commands at earlier steps, against
     differences of the simulator: of planned commands alone, and of a policy that reacts.
 
     Under rates of 10 and 4 rad/s the motors of an X500 saturate, and these fail."""

@@ -1,4 +1,4 @@
-"""The log of a training: what stands in the file, what is left, what is printed."""
+"""The log of a training: its file, the remaining time, its output."""
 
 import csv
 

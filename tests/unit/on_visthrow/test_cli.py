@@ -34,7 +34,7 @@ def run(*arguments: str, **options) -> subprocess.CompletedProcess:
 
 @fixture
 def command(monkeypatch):
-    """Install a command 'try' whose ``run`` raises or returns what the test wants."""
+    """Install a command 'try' whose ``run`` raises or returns a given value."""
 
     def install(outcome):
         def run(args):
@@ -251,7 +251,9 @@ def test_suggestions():
 
 
 class MixedMujoco:
-    """What importing mujoco.batch does where MuJoCo 3 was installed over parts of mujoco-core 4."""
+    """The failure of importing mujoco.batch where MuJoCo 3 was installed over parts of mujoco-core
+    4.
+    """
 
     def find_spec(self, name, path=None, target=None):
         if name == "mujoco.batch":

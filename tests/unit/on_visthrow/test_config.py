@@ -1,4 +1,4 @@
-"""Strict configuration: what is accepted, what is refused, and what the message says."""
+"""Strict configuration: accepted files, refused files, and the messages."""
 
 from dataclasses import dataclass
 from pathlib import Path

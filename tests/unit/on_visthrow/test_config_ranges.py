@@ -1,4 +1,4 @@
-"""What no plant, camera or training can be is refused where the configuration is read, and a copied
+"""Impossible plants, cameras and trainings are refused when the configuration is read, and a copied
 file finds its base.
 """
 

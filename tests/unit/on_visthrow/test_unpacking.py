@@ -1,5 +1,5 @@
-"""Files that unpack to far more than their size are refused before they are read; long reads say
-how far they are.
+"""Files that unpack to far more than their size are refused before they are read; long reads report
+their progress.
 """
 
 import gzip

@@ -1,4 +1,4 @@
-"""Work side by side: results, errors and what ends early."""
+"""Parallel work: results, errors and early ends."""
 
 import math
 import os
@@ -11,7 +11,7 @@ from visthrow.common.workers import Workers, done, progress
 
 
 def squared(number: float) -> float:
-    """Of slow work that says how far it is."""
+    """Progress of slow work."""
     progress(0.5)
     time.sleep(0.01 * number)
     return number * number
