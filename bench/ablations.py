@@ -237,13 +237,13 @@ def on_held_back(
     only = sorted({lacks, *theta})
     model = ThrowModel([FlightLog.load(path) for path in logs], plant, device=device, only=only)
     (before, after, _), samples = shortfalls(model, sizes)
-    found = {"before": before, "after": after, "samples": samples}
+    losses = {"before": before, "after": after, "samples": samples}
     for who, theta_ in zip(("before", "after", "whole"), sizes):
         off = model.landings(theta_).errors
-        found[f"landing_{who}"] = (
+        losses[f"landing_{who}"] = (
             float(np.mean(off)) if len(off) and np.isfinite(off).all() else None
         )
-    return found
+    return losses
 
 
 def read(path: Path | None = None) -> dict[str, Any]:
@@ -272,7 +272,7 @@ def table(record: Mapping[str, Any]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for r in record["ablations"]:
-        found = (
+        names = (
             ", ".join(
                 f"{n} {size:+.3g} ({r['nats'][n]:.0f} nats)" for n, size in r["named"].items()
             )
@@ -293,7 +293,7 @@ def table(record: Mapping[str, Any]) -> str:
         )
         took = f"{r['seconds']:.0f}" if r["seconds"] else "-"
         lines.append(
-            f"| {r['lacks']} ({r['model']}) | {found} | {r['overall']}, {right} | {worth} | {off} |"
+            f"| {r['lacks']} ({r['model']}) | {names} | {r['overall']}, {right} | {worth} | {off} |"
             f" {took} |"
         )
     return "\n".join(lines)

@@ -64,23 +64,23 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
     shipped = Policy.load(find_policy("state"))
     altered = extended(nominal, hidden)
     policy, figures = adapted(altered, shipped, args)
-    found = {"hidden": dict(hidden), **figures}
+    errors = {"hidden": dict(hidden), **figures}
     for stage, experiment, thrower in zip(
         STAGES, (nominal, altered, altered), (shipped, shipped, policy), strict=True
     ):
         throws = throw(
             experiment, thrower.to(args.device).actor(THROWS), TARGET, THROWS, args.device, SEED
         )
-        found[stage] = throws.error[throws.success].round(5).tolist()
-    write_json(kept, found)
-    return found
+        errors[stage] = throws.error[throws.success].round(5).tolist()
+    write_json(kept, errors)
+    return errors
 
 
-def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
+def report(records_of: Sequence[Mapping[str, Any]], where: str) -> records.Report:
     """Table of the alterations."""
     rows = []
     figures = []
-    for f in found:
+    for f in records_of:
         errors = {stage: 1e3 * np.array(f[stage]) for stage in STAGES}
         mean = {stage: float(e.mean()) for stage, e in errors.items()}
         won = (mean["before"] - mean["after"]) / (mean["before"] - mean["home"])
@@ -128,15 +128,15 @@ def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
 def run(args: argparse.Namespace) -> int:
     """Measure every alteration and report."""
     args.device = compute_device.resolve(args.device)
-    found = []
+    alterations = []
     for hidden in [record["hidden"] for record in loop.read()]:
         if not args.only or set(hidden) & set(args.only):
-            found.append(
+            alterations.append(
                 measured(
                     Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items()), hidden, args
                 )
             )
-    return records.finish(report(found, args.device), args)
+    return records.finish(report(alterations, args.device), args)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

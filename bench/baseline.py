@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     importlib.import_module("piqp")  # printed once, not by every worker
     path = Path(args.records) / "throws" / "baseline.json"
     known = results.load_all([path])
-    found = results.work(
+    units = results.work(
         full(),
         args.out,
         thrower.fly_unit,
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
         args.jobs,
         lambda text: print(text, file=sys.stderr, flush=True),
     )
-    results.pack(found.values(), path)
+    results.pack(units.values(), path)
     print(path)
     return 0
 

@@ -47,16 +47,16 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, metavar="SEED")
     parser.add_argument("--yaw", type=int, choices=(1, -1), default=1, help="-1: turned")
     args = parser.parse_args()
-    found = []
+    errors = []
     for seed in range(args.first, args.first + args.throws):
         off, summary, fake = fly(seed, args.yaw)
-        found += [] if off is None else [off]
+        errors += [] if off is None else [off]
         outcome = "not landed" if off is None else f"{off:.3f} m"
         breaches = f"; {fake.witness.breaches}" if fake.witness.breaches else ""
         print(f"seed {seed}: {outcome}; {summary['reason']}{breaches}", flush=True)
-    print(f"{len(found)} of {args.throws} landed", end="")
-    if found:
-        print(f"; {np.mean(found):.4f} m in the mean, {max(found):.3f} m at most", end="")
+    print(f"{len(errors)} of {args.throws} landed", end="")
+    if errors:
+        print(f"; {np.mean(errors):.4f} m in the mean, {max(errors):.3f} m at most", end="")
     print()
 
 

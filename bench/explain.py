@@ -38,7 +38,7 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
         model, seed=args.seed, without=opening.numbers(args.without, logs)
     )
     explained = time.perf_counter()
-    found = {
+    seconds = {
         "open": opened - begun,
         "explain": explained - opened,
         "verdict": explained - begun,
@@ -50,8 +50,8 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     if not args.no_report and diagnosis.work is not None:
         with tempfile.TemporaryDirectory() as folder:
             explain_cli.write_report(Path(folder), diagnosis, model, logs, args.seed)
-        found["report"] = time.perf_counter() - explained
-    return found
+        seconds["report"] = time.perf_counter() - explained
+    return seconds
 
 
 def run(args: argparse.Namespace) -> int:
@@ -62,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     bar = VERDICT_S["cuda" if device.startswith("cuda") else "cpu"]
     bars = {"verdict": f"{bar:g}", "report": f"{REPORT_S:g}"}
     rows = tuple(
-        (stage, *(f"{found[stage]:.1f}" for found in runs), bars.get(stage, "")) for stage in stages
+        (stage, *(f"{stage_seconds[stage]:.1f}" for stage_seconds in runs), bars.get(stage, ""))
+        for stage in stages
     )
     header = ("stage [s]", *(f"run {i + 1}" for i in range(len(runs))), "bar")
     first = runs[0]

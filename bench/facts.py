@@ -24,8 +24,8 @@ def lines(repository: str, version: str, file: str) -> tuple[str, ...]:
 def stands(fact: Fact, repository: str) -> bool:
     """Return whether the words of a row stand on its line, whatever the spaces."""
     file, _, number = fact.at.rpartition(":")
-    found = lines(repository, fact.version, file)[int(number) - 1 : int(number)]
-    return any("".join(fact.text.split()) in "".join(line.split()) for line in found)
+    cited = lines(repository, fact.version, file)[int(number) - 1 : int(number)]
+    return any("".join(fact.text.split()) in "".join(line.split()) for line in cited)
 
 
 def main() -> int:

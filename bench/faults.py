@@ -308,16 +308,16 @@ def faults(args: argparse.Namespace) -> Report:
         done = dict(_announced(side_by_side(inject, names, assign_cores(args.jobs))))
         for name in names:
             case = cases[name]
-            found = done[name]
-            figures[name] = found
+            result = done[name]
+            figures[name] = result
             row = (
                 name,
                 case.text,
-                _describe_steps(found["states"]),
-                _describe_steps(found["events"]) or "-",
+                _describe_steps(result["states"]),
+                _describe_steps(result["events"]) or "-",
             )
-            counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (
-                str(len(found["breaches"])),
+            counts = tuple(str(result[key]) for key in ("missed", "commands", "releases")) + (
+                str(len(result["breaches"])),
             )
             rows.setdefault(case.group, []).append((*row, *counts))
     notes = (
@@ -351,8 +351,10 @@ def faults(args: argparse.Namespace) -> Report:
     return Report("hil", "What the runner does when something fails", tables, notes, figures)
 
 
-def _announced(found: Iterator[tuple[str, dict[str, Any]]]) -> Iterator[tuple[str, dict[str, Any]]]:
-    for name, values in found:
+def _announced(
+    results: Iterator[tuple[str, dict[str, Any]]],
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name, values in results:
         print(f"{name}: {_describe_steps(values['states'])}", file=sys.stderr, flush=True)
         yield name, values
 

@@ -28,13 +28,13 @@ def json_lines(path: Path) -> list[dict[str, Any]]:
     """Values of a file of JSON lines, without a truncated last line; none where the file is
     missing.
     """
-    found = []
+    values = []
     for row in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         try:
-            found.append(json.loads(row))
+            values.append(json.loads(row))
         except ValueError:
             break
-    return found
+    return values
 
 
 def finite(value: float | None) -> bool:

@@ -187,10 +187,10 @@ def _rivals(
         status(f"training for {_label(vehicle)}, of {len(vehicles)}")
         _trained(_one(base, vehicle), device).save(path)
         longest = max(longest, time.monotonic() - start)
-    found = {vehicle: folder / f"{vehicle}.npz" for vehicle in vehicles}
+    paths = {vehicle: folder / f"{vehicle}.npz" for vehicle in vehicles}
     return {
         vehicle: (Policy.load(path), _one(base, vehicle))
-        for vehicle, path in found.items()
+        for vehicle, path in paths.items()
         if path.exists()
     }
 
@@ -239,13 +239,13 @@ def _report(rows: Sequence[Row], seconds: dict[str, float]) -> Report:
     rivals = [_label(k) for k in seconds]
     groups = {DRAWN: [v for v in names if v.isdigit()]} | {v: [v] for v in names if not v.isdigit()}
     groups |= {"those with a specialised policy": rivals} if len(rivals) > 1 else {}
-    found = {(row.policy, row.vehicle) for row in rows}
+    thrown = {(row.policy, row.vehicle) for row in rows}
     policies = list(dict.fromkeys(row.policy for row in rows))
     shown = [
         (label, policy, vehicles)
         for label, vehicles in groups.items()
         for policy in policies
-        if vehicles and all((policy, vehicle) in found for vehicle in vehicles)
+        if vehicles and all((policy, vehicle) in thrown for vehicle in vehicles)
     ]
     header = (
         "vehicles",

@@ -47,14 +47,14 @@ def in_training(
     """Calibrations, or None, in the training simulator; the drawn turns [rad] and errors of the
     focal length [-].
     """
-    found: list = []
+    calibrations: list = []
     torch.manual_seed(seed)
     with torch.inference_mode():
         env = ThrowEnv(flown, device, seed, count)
         env.fix_goal(torch.tensor(GOAL, device=device))
-        start_calibrated(flown, found)(env)
+        start_calibrated(flown, calibrations)(env)
         return (
-            found,
+            calibrations,
             env.view.buffers["extrinsic_rotation"].cpu().numpy(),
             env.view.buffers["scale_error"].flatten().cpu().numpy(),
         )
@@ -112,8 +112,12 @@ def on_reference(
         try_calibration, camera=flown.camera, contract=contract_of(flown), spreads=spreads
     )
     with Workers(solve, hovers, cores(), "calibrations") as workers:
-        found = dict(workers)
-    return [None if isinstance(found[i], str) else found[i] for i in range(count)], turn, scale
+        calibrations = dict(workers)
+    return (
+        [None if isinstance(calibrations[i], str) else calibrations[i] for i in range(count)],
+        turn,
+        scale,
+    )
 
 
 def main() -> None:
@@ -130,15 +134,15 @@ def main() -> None:
     flown = hover_start(load_experiment("vision_ideal", DRAWN))
     tilt_limit = TILT_DEG
     if args.plant == "hybrid":
-        found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
+        calibrations, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
-        found, turn, scale = on_reference(flown, args.plant, args.count, args.seed)
+        calibrations, turn, scale = on_reference(flown, args.plant, args.count, args.seed)
         tilt_limit = 0.5 * TILT_DEG
-    known = [i for i, one in enumerate(found) if one is not None]
-    off = np.degrees([np.array(found[i].turn_b) - turn[i] for i in known])
-    sigma = np.degrees([found[i].turn_sigma for i in known])
-    late = np.array([found[i].latency for i in known])
-    scaled = np.array([found[i].scale - scale[i] for i in known])
+    known = [i for i, one in enumerate(calibrations) if one is not None]
+    off = np.degrees([np.array(calibrations[i].turn_b) - turn[i] for i in known])
+    sigma = np.degrees([calibrations[i].turn_sigma for i in known])
+    late = np.array([calibrations[i].latency for i in known])
+    scaled = np.array([calibrations[i].scale - scale[i] for i in known])
     print(f"{len(known)} of {args.count} hovers gave an answer")
     for axis, name in enumerate(("roll", "pitch", "yaw")):
         rms = np.sqrt(np.mean(off[:, axis] ** 2))

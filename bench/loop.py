@@ -232,13 +232,13 @@ class Loop:
             kept = {"error": result.error, "duration": result.duration}
             kept = {name: np.round(values, DIGITS).tolist() for name, values in kept.items()}
             write_json(path, kept | {"success": np.asarray(result.success, dtype=bool).tolist()})
-        found = json.loads(path.read_text())
-        error = landed(found)
+        throws = json.loads(path.read_text())
+        error = landed(throws)
         say(
             f"thrown: {name}, {len(error)} landed"
             + (f", {np.mean(error):.3f} m" if len(error) else "")
         )
-        return found
+        return throws
 
 
 def read(places: Sequence[Path] = ()) -> list[dict[str, Any]]:
@@ -394,7 +394,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for r in records:
-        found = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
+        names = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
         errors = {name: landed(throws) for name, throws in r["throws"].items()}
         cells = []
         for name in WHO:
@@ -414,7 +414,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
                 f"{100 * share['share']:.0f} % [{100 * share['low']:.0f},"
                 f" {100 * share['high']:.0f}]"
             )
-        lines.append(f"| {hidden_text(r)} | {found} | {' | '.join(cells)} | {won} |")
+        lines.append(f"| {hidden_text(r)} | {names} | {' | '.join(cells)} | {won} |")
     return "\n".join(lines)
 
 

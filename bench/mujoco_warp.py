@@ -114,11 +114,11 @@ def measure(
     }
 
 
-def table(found: dict[str, Any]) -> Table:
+def table(rates: dict[str, Any]) -> Table:
     """Printed form of :func:`measure`."""
     cells = [
         (f"{r['batch']:,}", rate(r["substeps_per_s"]), rate(r["env_steps_per_s"]))
-        for r in found["rows"]
+        for r in rates["rows"]
     ]
-    title = f"MuJoCo Warp, bare rope, implicitfast with armature, {found['step_s'] * 1e3:g} ms"
+    title = f"MuJoCo Warp, bare rope, implicitfast with armature, {rates['step_s'] * 1e3:g} ms"
     return Table(title, ("worlds", "substeps/s", "env-steps/s"), tuple(cells))

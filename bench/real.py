@@ -459,12 +459,12 @@ def _opened(text: str, folder: Path) -> tuple[str, Callable[[Logs], NumericModel
 
 def _read(files: Sequence[str], data: Path, setup: str) -> Logs:
     """Logs; ``FILE@SHARE``: from this share of its time on."""
-    found: Logs = []
+    read: Logs = []
     for file in files:
         name, _, begin = file.partition("@")
         logs = setups.read_logs([data / name], setup)
-        found += cut(float(begin), 1.01)(logs) if begin else logs
-    return found
+        read += cut(float(begin), 1.01)(logs) if begin else logs
+    return read
 
 
 def run(task: tuple[Case, Path]) -> dict:
@@ -538,7 +538,7 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
 
     A class agrees where one of its members does.
     """
-    found = []
+    agreements = []
     for a, b in combinations(rows, 2):
         if a["of"] != b["of"]:
             continue
@@ -546,7 +546,7 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
         for name, members in sorted(names.items()):
             both = [m for m in members if m in a["sizes"] and m in b["sizes"]]
             if both:
-                found.append(
+                agreements.append(
                     (
                         a["case"],
                         b["case"],
@@ -554,7 +554,7 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
                         any(_one_size(a["sizes"][m], b["sizes"][m]) for m in both),
                     )
                 )
-    return found
+    return agreements
 
 
 def _one_size(a: Sequence, b: Sequence) -> bool:

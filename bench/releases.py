@@ -88,13 +88,13 @@ class _Watched(ThrowEnv):
         self.bow = torch.where(hanging, torch.maximum(self.bow, off), self.bow)
         self.slack = torch.where(hanging, torch.maximum(self.slack, lengths - chord), self.slack)
         gone = self.open & self.last["released"]
-        found = {
+        fields = {
             "ball": "payload_pos_w",
             "vel": "payload_vel_w",
             "vehicle": "release_pos_w",
             "landing": "landing_w",
         }
-        for name, field in found.items():
+        for name, field in fields.items():
             self.kept[name] = torch.where(gone[:, None], out[field], self.kept[name])
         time = self.last["duration"] - out["time_to_impact"]
         self.time = torch.where(gone, time, self.time)
@@ -133,14 +133,14 @@ def releases(loaded: Loaded, target: float, count: int, device: str, seed: int =
     return Releases(*(part.cpu().numpy().astype(float) for part in parts))
 
 
-def row(name: str, where: str, found: Releases) -> str:
+def row(name: str, where: str, releases: Releases) -> str:
     """A line of the table of :data:`HEAD`."""
-    points = (found.ball_w, found.ball_vel_w, found.vehicle_w, found.landing_w)
+    points = (releases.ball_w, releases.ball_vel_w, releases.vehicle_w, releases.landing_w)
     ball, vel, vehicle, landing = (np.nanmean(point, axis=0) for point in points)
-    bow = 1e3 * found.bow
-    slack = 1e3 * found.slack
+    bow = 1e3 * releases.bow
+    slack = 1e3 * releases.slack
     return (
-        f"| {name} | {where} | {np.nanmean(found.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
+        f"| {name} | {where} | {np.nanmean(releases.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
         f" {vel[0]:.2f}, {vel[2]:.2f} m/s | {vehicle[0]:.3f}, {vehicle[2]:.3f} m | {landing[0]:.3f}"
         f" m | {bow.mean():.1f}, {bow.max():.1f} mm | {slack.mean():.1f}, {slack.max():.1f} mm |"
     )

@@ -144,7 +144,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _sweeps(name: str, points: Points) -> dict[str, list[tuple[float, float]]]:
-    found = {}
+    sweeps = {}
     for key, values in SWEEPS.items():
         rows = []
         for value in values:
@@ -154,8 +154,8 @@ def _sweeps(name: str, points: Points) -> dict[str, list[tuple[float, float]]]:
                 return thrown(loaded.experiment, loaded.policy)
 
             rows.append((value, points.get((name, key, value), throw)["error"]))
-        found[key] = rows
-    return found
+        sweeps[key] = rows
+    return sweeps
 
 
 def _held(name: str, axes: str, points: Points) -> float:
@@ -172,7 +172,7 @@ def _held(name: str, axes: str, points: Points) -> float:
 def _effects(
     name: str, experiment: Experiment, policy: Any, points: Points
 ) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+    effects: dict[str, dict[str, Any]] = {}
     for effect_name, effect in catalogue().items():
         camera = effect.block == "camera" and experiment.task.observation.layout != "vision"
         if effect.block in BLOCKS or camera:
@@ -192,8 +192,8 @@ def _effects(
             signs["+" if sign > 0 else "-"] = {"size": crossing(rows), "points": rows}
         if signs:
             unit = {"unit": effect.unit, "prior_sd": effect.prior_sd, "cause": effect.cause}
-            found[effect_name] = {**unit, **signs}
-    return found
+            effects[effect_name] = {**unit, **signs}
+    return effects
 
 
 def _report(figures: dict[str, Any]) -> Report:
@@ -201,23 +201,23 @@ def _report(figures: dict[str, Any]) -> Report:
     for key in SWEEPS:
         head = (key, *(f"{value:g}" for value in SWEEPS[key]))
         rows = [
-            (name, *(f"{error:.4f}" for _, error in found["sweeps"][key]))
-            for name, found in figures.items()
+            (name, *(f"{error:.4f}" for _, error in entry["sweeps"][key]))
+            for name, entry in figures.items()
         ]
         tables.append(Table(key, head, tuple(rows)))
     rows = [
-        (name, *(f"{found['wrench'][axes]:.4f}" for axes in AXES))
-        for name, found in figures.items()
+        (name, *(f"{entry['wrench'][axes]:.4f}" for axes in AXES))
+        for name, entry in figures.items()
     ]
     tables.append(
         Table("Axes in which the wrench is held for 2 ms", ("policy", *AXES), tuple(rows))
     )
-    for name, found in figures.items():
+    for name, entry in figures.items():
         rows = []
-        for effect, row in found["effects"].items():
+        for effect, row in entry["effects"].items():
             cells = [row.get(sign, {}).get("size") for sign in "+-"]
             rows.append((effect, row["unit"], f"{row['prior_sd']:.3g}", *map(_size, cells)))
-        near = [(min(_priors(row)), line) for row, line in zip(found["effects"].values(), rows)]
+        near = [(min(_priors(row)), line) for row, line in zip(entry["effects"].values(), rows)]
         head = ("effect", "unit", "prior deviation", "+", "-")
         title = f"{name}: size at which landings miss by {MISS:.2f} m"
         tables.append(Table(title, head, tuple(line for _, line in sorted(near))))
@@ -227,8 +227,8 @@ def _report(figures: dict[str, Any]) -> Report:
 
 def _priors(row: dict[str, Any]) -> list[float]:
     """Sizes in prior deviations, infinite where there is none."""
-    found = [row.get(sign, {}).get("size") for sign in "+-"]
-    return [math.inf if size is None else abs(size) / row["prior_sd"] for size in found]
+    sizes = [row.get(sign, {}).get("size") for sign in "+-"]
+    return [math.inf if size is None else abs(size) / row["prior_sd"] for size in sizes]
 
 
 def _size(size: float | None) -> str:
@@ -246,23 +246,23 @@ def picture(figures: dict[str, Any], path: Path, shown: int = 16) -> None:
         (one, next(iter(SWEEPS.items())), 1e3, "mass of the rope [g]"),
         (two, list(SWEEPS.items())[1], 1e6, "joint damping [µN m s]"),
     ):
-        for name, found in figures.items():
-            error = [1e3 * e for _, e in found["sweeps"][key]]
+        for name, entry in figures.items():
+            error = [1e3 * e for _, e in entry["sweeps"][key]]
             axes.plot(np.array(values) * factor, error, "o-", label=name)
         axes.axhline(1e3 * MISS, color="gray", linestyle=":")
         axes.set(xlabel=label, ylabel="landing error [mm]", ylim=(0.0, 1.1e3 * MISS))
     two.set_xscale("symlog", linthresh=1.0)
     one.legend(frameon=False)
     every: dict[str, float] = {}
-    for found in figures.values():
-        for effect, row in found["effects"].items():
+    for entry in figures.values():
+        for effect, row in entry["effects"].items():
             every[effect] = min(every.get(effect, math.inf), min(_priors(row)))
     names = [e for e in sorted(every, key=every.__getitem__) if math.isfinite(every[e])][:shown]
-    for number, (name, found) in enumerate(figures.items()):
+    for number, (name, entry) in enumerate(figures.items()):
         rows = [
-            (k, min(_priors(found["effects"][e])))
+            (k, min(_priors(entry["effects"][e])))
             for k, e in enumerate(names)
-            if e in found["effects"]
+            if e in entry["effects"]
         ]
         three.plot([size for _, size in rows], [k + 0.2 * number for k, _ in rows], "o", label=name)
     three.set(xscale="log", xlabel=f"size at a miss of {1e3 * MISS:.0f} mm [prior deviations]")

@@ -229,11 +229,11 @@ def measure(
         "rivals": {},
     }
     for name, scene in rivals.items():
-        found = {"scene": scene.name, "step_s": scene.step, "pairs": pairs[name], "bar": BARS[name]}
-        found["s_per_s"] = statistics.median(b for _, b in pairs[name])
-        found["ratio"] = statistics.median(b / a for a, b in pairs[name])
-        rows.append(_row(scene.name, found["s_per_s"], found["ratio"], errors[name], period))
-        figures["rivals"][name] = found
+        rival = {"scene": scene.name, "step_s": scene.step, "pairs": pairs[name], "bar": BARS[name]}
+        rival["s_per_s"] = statistics.median(b for _, b in pairs[name])
+        rival["ratio"] = statistics.median(b / a for a, b in pairs[name])
+        rows.append(_row(scene.name, rival["s_per_s"], rival["ratio"], errors[name], period))
+        figures["rivals"][name] = rival
     header = (
         "plant",
         "wall time a simulated second",

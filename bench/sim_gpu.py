@@ -109,11 +109,11 @@ def measure(
     if with_mujoco:
         from bench import mujoco_warp
 
-        found = mujoco_warp.measure(device, min(repeats, 3), plant.sim.control_period)
-        figures["mujoco_warp"] = found
-        if "rows" in found:
-            found["ratio"] = {k: top[k] / found["best"]["env_steps_per_s"] for k in top}
-            tables.append(mujoco_warp.table(found))
+        rates = mujoco_warp.measure(device, min(repeats, 3), plant.sim.control_period)
+        figures["mujoco_warp"] = rates
+        if "rows" in rates:
+            rates["ratio"] = {k: top[k] / rates["best"]["env_steps_per_s"] for k in top}
+            tables.append(mujoco_warp.table(rates))
     return Report(
         "sim", f"Simulator on {device_name(device)}", tuple(tables), _notes(figures), figures
     )
@@ -155,11 +155,11 @@ def _notes(figures: dict[str, Any]) -> tuple[str, ...]:
         )
         + f" (bar {BARS['env_steps_per_s'] / 1e6:.0f} M).",
     ]
-    found = figures["mujoco_warp"]
-    if found is not None:
-        ratios = found.get("ratio")
+    rates = figures["mujoco_warp"]
+    if rates is not None:
+        ratios = rates.get("ratio")
         notes.append(
-            found["why_not"]
+            rates["why_not"]
             if ratios is None
             else (
                 f"Over MuJoCo Warp's best: hover {ratios['hover']:.0f}, full range"

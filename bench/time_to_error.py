@@ -104,9 +104,9 @@ def measure(
     rows = []
     for name, trained in runs.items():
         for error in sorted(errors, reverse=True):
-            found = [run["reached"][f"{error:g}"] for run in trained]
-            times = sorted(hit[0] if hit else math.inf for hit in found)
-            steps = sorted(hit[1] if hit else math.inf for hit in found)
+            reached = [run["reached"][f"{error:g}"] for run in trained]
+            times = sorted(hit[0] if hit else math.inf for hit in reached)
+            steps = sorted(hit[1] if hit else math.inf for hit in reached)
             middle = statistics.median(times)
             least = statistics.median(steps)
             rows.append(
@@ -116,7 +116,7 @@ def measure(
                     _seconds(middle),
                     f"{_seconds(times[0])} to {_seconds(times[-1])}",
                     rate(least) if math.isfinite(least) else "-",
-                    f"{sum(map(bool, found))} of {len(seeds)}",
+                    f"{sum(map(bool, reached))} of {len(seeds)}",
                 )
             )
     header = (

@@ -113,13 +113,13 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
         for _ in range(steps):
             alg.act(observations)
 
-    found = {}
+    durations = {}
     for name, function in (("simulation", simulate), ("step", steps_of_env), ("inference", infer)):
         reset()
-        found[name] = seconds(
+        durations[name] = seconds(
             function, device, repeats, reset if name == "simulation" else lambda: None
         )
-    return found
+    return durations
 
 
 def split(total: dict[str, float], parts: dict[str, float]) -> dict[str, float]:

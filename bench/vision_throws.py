@@ -167,11 +167,11 @@ def _report(figures: dict[str, dict[str, Any]]) -> Report:
     )
 
 
-def _cell(found: dict[str, float] | None) -> str:
-    if found is None:
+def _cell(figures: dict[str, float] | None) -> str:
+    if figures is None:
         return "-"
-    text = f"{found['error']:.4f} [{found['low']:.4f}, {found['high']:.4f}]"
-    return text if found["landed"] == 1.0 else f"{text}, {100 * found['landed']:.0f} % landed"
+    text = f"{figures['error']:.4f} [{figures['low']:.4f}, {figures['high']:.4f}]"
+    return text if figures["landed"] == 1.0 else f"{text}, {100 * figures['landed']:.0f} % landed"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

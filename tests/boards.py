@@ -75,7 +75,7 @@ def pictures(name: str) -> list[np.ndarray]:
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
     rays, visible = pixel_rays(lens.params, samples)
     rays = rays.float()
-    found = []
+    images = []
     for *tilt, x, y in POSES:
         rot_cm = rotation_from_vector(torch.tensor(tilt))
         origin = torch.tensor([x, y, 0.18]) - rot_cm @ middle
@@ -94,5 +94,5 @@ def pictures(name: str) -> list[np.ndarray]:
         )
         drawn = np.where(inside, drawn, 0).astype(np.float32)
         mean = drawn.reshape(lens.params.height, samples, lens.params.width, samples).mean((1, 3))
-        found.append(np.round(mean).astype(np.uint8))
-    return found
+        images.append(np.round(mean).astype(np.uint8))
+    return images

@@ -92,8 +92,8 @@ def by_aeroid(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[floa
     )
     columns = np.moveaxis(positions, 0, 1).reshape(len(stamps), -1)
     data = aeroid.FlightData(stamps, dict(zip(places, columns.T)))
-    found = aeroid.identify(model, data, [*NAMES, *begin], x0=np.zeros(len(states)))
-    return {name: (found.parameters[name], found.stderr[name]) for name in NAMES}
+    fitted = aeroid.identify(model, data, [*NAMES, *begin], x0=np.zeros(len(states)))
+    return {name: (fitted.parameters[name], fitted.stderr[name]) for name in NAMES}
 
 
 def model_of(stamps: np.ndarray, positions: np.ndarray) -> BallModel:
@@ -108,9 +108,9 @@ def model_of(stamps: np.ndarray, positions: np.ndarray) -> BallModel:
 
 def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
     """Estimates of the diagnosis' estimator, with the same parameter names."""
-    found = fitting.fit(model_of(stamps, positions), NAMES)
+    fitted = fitting.fit(model_of(stamps, positions), NAMES)
     return {
-        name: (float(found.theta[i]), float(np.sqrt(found.covariance[i, i])))
+        name: (float(fitted.theta[i]), float(np.sqrt(fitted.covariance[i, i])))
         for i, name in enumerate(NAMES)
     }
 
@@ -123,9 +123,10 @@ def compared(seed: int, colour: str) -> dict:
     line = {"seed": seed, "noise": colour or "white", "truth": truth}
     for who, ask in (("aeroid", by_aeroid), ("fit", by_fit)):
         begin = time.perf_counter()
-        found = ask(stamps, positions)
+        estimates = ask(stamps, positions)
         line[who] = {
-            name: {"error": value - truth[name], "sd": sd} for name, (value, sd) in found.items()
+            name: {"error": value - truth[name], "sd": sd}
+            for name, (value, sd) in estimates.items()
         }
         line[f"{who}_s"] = time.perf_counter() - begin
     begin = time.perf_counter()
@@ -153,17 +154,17 @@ def summary(lines: list[dict]) -> dict:
     for noise in sorted({line["noise"] for line in lines}):
         group = [line for line in lines if line["noise"] == noise]
         for who in ("aeroid", "fit"):
-            found = [line[who][name] for line in group for name in NAMES]
+            pairs = [line[who][name] for line in group for name in NAMES]
             out[f"{noise}: {who}"] = {
                 "worlds": len(group),
                 "rms": {
                     name: float(np.sqrt(np.mean([line[who][name]["error"] ** 2 for line in group])))
                     for name in NAMES
                 },
-                "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in found)} of {len(found)}",
+                "held": f"{sum(abs(f['error']) < 1.96 * f['sd'] for f in pairs)} of {len(pairs)}",
                 "seconds": float(np.median([line[f"{who}_s"] for line in group])),
             }
-        sizes = [found for line in group for found in line["explain"].values()]
+        sizes = [pairs for line in group for pairs in line["explain"].values()]
         out[f"{noise}: explain"] = {
             "worlds": len(group),
             "known": sum(line["overall"] == "KNOWN" for line in group),

@@ -136,10 +136,10 @@ def size_is(verdict: dict, name: str, size: float) -> bool:
     """Whether a named effect has this size within its deviation; true where another of its class
     was named.
     """
-    found = [
+    findings = [
         f for f in verdict["findings"] if f["name"] == name and f["verdict"] in ("FOUND", "CLASS")
     ]
-    return all(abs(f["estimate"] - size) < NEAR * max(f["sd"], f["floor"]) for f in found)
+    return all(abs(f["estimate"] - size) < NEAR * max(f["sd"], f["floor"]) for f in findings)
 
 
 def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: theta) -> bool:
@@ -247,10 +247,15 @@ def _twice(
     logs = logs_of(recipe)
     first = explained(folder, logs, recipe)
     second = explained(folder, change(logs), recipe)
-    found = any(
+    is_found = any(
         is_right(first, name) for name in recipe.effects
     )  # an effect missed here must be missed in the transformed logs, too
-    return {"passed": same(first, second, sizes), "found": found, "said": second, "before": first}
+    return {
+        "passed": same(first, second, sizes),
+        "found": is_found,
+        "said": second,
+        "before": first,
+    }
 
 
 def turn(recipe: Recipe, folder: Path) -> dict:
@@ -352,13 +357,13 @@ def draw(kind: str, seed: int, floors: float = 15.0) -> Recipe:
 
 def brief(verdict: dict) -> dict:
     """The part of a verdict that the ledger keeps."""
-    found = [f for f in verdict["findings"] if f["verdict"] in ("FOUND", "CLASS")]
+    findings = [f for f in verdict["findings"] if f["verdict"] in ("FOUND", "CLASS")]
     keep = ("name", "verdict", "estimate", "sd", "partners")
     return {
         "overall": verdict["overall"],
         "reasons": verdict.get("reasons"),
         "theta": verdict.get("theta"),
-        "findings": [{k: f[k] for k in keep} for f in found],
+        "findings": [{k: f[k] for k in keep} for f in findings],
         "seconds": verdict.get("seconds"),
     }
 

@@ -135,24 +135,24 @@ def curve(size: np.ndarray, named: np.ndarray) -> Curve:
     return Curve(half, width, weight / weight.sum())
 
 
-def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1.0) -> str:
+def within(interval: tuple[float, float, float], size: np.ndarray, scale: float = 1.0) -> str:
     """A size and its interval as text, times ``scale``; values outside the flown sizes appear as a
     bound.
     """
     least = size.min()
     most = size.max()
     texts = []
-    for x in found:
+    for x in interval:
         sign = "<" if x < least else ">" if x > most else ""
         texts.append(f"{sign}{float(np.clip(x, least, most)) * scale:.2g}")
     return "{} [{}, {}]".format(*texts)
 
 
-def met(found: tuple[float, float, float], limit: float) -> str:
+def met(interval: tuple[float, float, float], limit: float) -> str:
     """Whether a size and its interval lie below a limit."""
     if math.isnan(limit):
         return "-"
-    return "yes" if found[2] <= limit else "no" if found[1] > limit else "not resolved"
+    return "yes" if interval[2] <= limit else "no" if interval[1] > limit else "not resolved"
 
 
 def truth_of(world: dict) -> set[str]:
@@ -188,7 +188,7 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
         group = answered(begun)
         finished = [w for w in group if "error" not in w]
         counts = np.array([names(w) for w in group]).reshape(-1, 4)
-        given, right, exact, found = map(int, counts.sum(0))
+        given, right, exact, hits = map(int, counts.sum(0))
         hidden = sum(len(truth_of(w)) for w in group)
         more = sum(int(c[0] > len(truth_of(w))) for c, w in zip(counts, group))
         overall = [
@@ -202,7 +202,7 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
             else "-"
         )
         row = [kind, len(group), len(group) - len(finished), len(begun) - len(group)]
-        row += [share(found, hidden), share(right, given), share(exact, given)]
+        row += [share(hits, hidden), share(right, given), share(exact, given)]
         row += [share(more, len(group)), *overall, seconds]
         lines.append("| " + " | ".join(map(str, row)) + " |")
     return lines

@@ -26,10 +26,10 @@ def thrown(policy: str, solver: str | None, target: float, args: Namespace) -> t
     changes = overrides(solver, args.substep) if solver else []
     item = load_policy(policy, args.config, [*changes, *args.overrides], args.allow)
     actor = item.policy.to(args.device).actor(args.throws)
-    found = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
+    outcome = throw(item.experiment, actor, target, args.throws, args.device, args.seed)
     name = Path(policy).stem if Path(policy).stem != "policy" else Path(policy).parent.name
     row = {"policy": name, "solver": solver or "its own", "substep": item.experiment.sim.substep}
-    return {**row, **found.summary()}, np.nan_to_num(found.landing_w).round(5).tolist()
+    return {**row, **outcome.summary()}, np.nan_to_num(outcome.landing_w).round(5).tolist()
 
 
 def run(args: Namespace) -> int:

@@ -136,10 +136,12 @@ def main() -> None:
     ):
         folder = args.out / f"{1e3 * step:g}ms"
         throws = [flown(folder, step, seed) for seed in args.seeds]
-        found = left([joined(where, *of) for where in throws], next(throws[0].glob("LOG*")), folder)
+        residuals = left(
+            [joined(where, *of) for where in throws], next(throws[0].glob("LOG*")), folder
+        )
         print(
             json.dumps(
-                {"step_s": step, "unfiltered": of[0], "commands_as_taken": of[1], "left": found}
+                {"step_s": step, "unfiltered": of[0], "commands_as_taken": of[1], "left": residuals}
             ),
             flush=True,
         )

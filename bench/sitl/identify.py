@@ -276,10 +276,10 @@ def fit(
             - windows.rows[chosen][:, :, 1:4]
         ).ravel()
 
-    found = least_squares(
+    solution = least_squares(
         off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25
     )
-    return found.x[:8], found.x[8:]
+    return solution.x[:8], solution.x[8:]
 
 
 def draw(

@@ -61,12 +61,12 @@ def main() -> None:
         plant.write_text(
             patch.with_firmware(boxes[0], str(path), config.load(Experiment, path), hover, DELAY)
         )
-        found = {"before": errors(logs, BASE), "settings": errors(logs, str(plant))}
+        distances = {"before": errors(logs, BASE), "settings": errors(logs, str(plant))}
         if args.diagnosis:
-            found["named"] = errors(
+            distances["named"] = errors(
                 logs, str(plant), json.loads(args.diagnosis.read_text())["theta"]
             )
-    mean = {key: float(value.mean()) for key, value in found.items()}
+    mean = {key: float(value.mean()) for key, value in distances.items()}
     less = {key: 1.0 - mean[key] / mean["before"] for key in mean if key != "before"}
     print(json.dumps({"throws": len(logs), "mean_m": mean, "less_by": less}, indent=1))
 

@@ -69,19 +69,19 @@ def series(args: argparse.Namespace) -> list[dict]:
     """Fly the missing throws of a series."""
     args.out.mkdir(parents=True, exist_ok=True)
     lines = args.out / f"{args.name}.jsonl"
-    found = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []
-    done = {(line["where"], line["distance"], line["seed"]) for line in found}
+    throws = [json.loads(text) for text in lines.read_text().splitlines()] if lines.exists() else []
+    done = {(line["where"], line["distance"], line["seed"]) for line in throws}
     for where in ("firmware", "own"):
         for distance in args.distances:
             for seed in range(args.seeds):
                 if (where, distance, seed) not in done:
-                    found.append(
+                    throws.append(
                         flown(where, distance, seed, args.policy, args.plant, args.out / args.name)
                     )
                     with open(lines, "a") as out:
-                        out.write(json.dumps(found[-1]) + "\n")
-                    print(json.dumps(found[-1]), flush=True)
-    return found
+                        out.write(json.dumps(throws[-1]) + "\n")
+                    print(json.dumps(throws[-1]), flush=True)
+    return throws
 
 
 def table(record: dict) -> str:

@@ -67,9 +67,9 @@ def fly(
             landed = plant.landing["landing_time"]
             if landed is not None and plant.time > landed + AFTER:
                 break
-        found = runner.backend.audit.found.get("fc_version")
+        version = runner.backend.audit.found.get("fc_version")
         return {
-            "version": found,
+            "version": version,
             "reason": runner.machine.reason,
             **fake.report(),
             "killed": killed,

@@ -54,14 +54,14 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
     flown = hover_start(quiet("vision_ideal", *errors))
     torch.manual_seed(0)
     with torch.inference_mode():
-        env, found = ThrowEnv(flown, "cpu", 0, 4), []
+        env, calibrations = ThrowEnv(flown, "cpu", 0, 4), []
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
-        start_calibrated(flown, found)(env)
+        start_calibrated(flown, calibrations)(env)
         turn, scale = (
             env.view.buffers["extrinsic_rotation"].numpy(),
             env.view.buffers["scale_error"].flatten().numpy(),
         )
-    off = np.degrees([one.turn_b for one in found]) - np.degrees(turn)
+    off = np.degrees([one.turn_b for one in calibrations]) - np.degrees(turn)
     assert np.abs(off.mean(0)).max() < 0.025
     assert np.abs(off).max() < 0.06
-    assert np.abs(np.array([one.scale for one in found]) - scale).max() < 1.5e-3
+    assert np.abs(np.array([one.scale for one in calibrations]) - scale).max() < 1.5e-3

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from sim.kernels.state import COLLISION, NONFINITE
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
-from visthrow.onboard import actions, observations
+from visthrow.onboard import actions, obs
 from visthrow.task import terminations
 from visthrow.training.env import ThrowEnv
 
@@ -28,11 +28,11 @@ def env():
 
 def test_layouts_have_the_papers_sizes():
     params = load_experiment("vision_ideal").task.observation
-    assert observations.layout_of(load_experiment("state").task.observation).dimension == 35
-    assert observations.layout_of(params).dimension == 69
-    assert observations.layout_of(replace(params, validity=False)).dimension == 61
+    assert obs.layout_of(load_experiment("state").task.observation).dimension == 35
+    assert obs.layout_of(params).dimension == 69
+    assert obs.layout_of(replace(params, validity=False)).dimension == 61
     with raises(ValueError, match="expected 'state' or 'vision'"):
-        observations.layout_of(replace(params, layout="lidar"))
+        obs.layout_of(replace(params, layout="lidar"))
 
 
 def test_actor_does_not_see_what_only_the_critic_may(env):
@@ -48,9 +48,7 @@ def test_actor_does_not_see_what_only_the_critic_may(env):
     for name, value in saved.items():
         env.views.state[name].copy_(value)
     env.views.out["payload_vel_w"] -= 1.0
-    now = (
-        observations.VEHICLE + 5 + 2
-    )  # the payload's history moved on by one entry of the same value
+    now = obs.VEHICLE + 5 + 2  # the payload's history moved on by one entry of the same value
     assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
     assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
     assert (after["critic"] - before["critic"]).abs().amax(0).count_nonzero() >= 6
@@ -65,13 +63,11 @@ def test_the_papers_recipe_and_nothing_else(name):
     """
     paper = load_experiment(name)
     env = ThrowEnv(paper, count=32, seed=1)
-    observations, reward, _, extras = env.step(torch.zeros(32, 5))
+    obs, reward, _, extras = env.step(torch.zeros(32, 5))
     assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
-    assert observations["actor"].shape == (32, 61 if "vision" in name else 35)
-    assert observations["critic"].shape == (32, 38)
-    assert_array_equal(
-        observations["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy()
-    )
+    assert obs["actor"].shape == (32, 61 if "vision" in name else 35)
+    assert obs["critic"].shape == (32, 38)
+    assert_array_equal(obs["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy())
     assert not env.delay.age.any()
     assert env.views.state["charge_used"].max() < 1e-3, (
         "share of a full battery that one step may draw"
@@ -81,12 +77,10 @@ def test_the_papers_recipe_and_nothing_else(name):
         "a second costs 2 as in Table II; what is left are speeds and commands"
     )
     assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == approx(2e8, rel=1e-3)
-    kept = observations.clone()
+    kept = obs.clone()
     env.step(torch.zeros(32, 5))
     for group in ("actor", "critic"):
-        assert torch.equal(observations[group], kept[group]), (
-            "the next step writes tensors of its own"
-        )
+        assert torch.equal(obs[group], kept[group]), "the next step writes other tensors"
 
 
 def test_the_critic_sees_what_is_named():
@@ -103,15 +97,10 @@ def test_the_critic_sees_what_is_named():
     }
     for chosen in [(), ("exact",), ("mass",), ("exact", "mount"), tuple(named), ("exact", *named)]:
         altered = replace(e, ppo=replace(e.ppo, privileged=chosen))
-        observations = ThrowEnv(altered, count=4).get_observations()
+        obs = ThrowEnv(altered, count=4).get_observations()
         known = sum(named.get(name, 0) for name in chosen)
-        assert observations["critic"].shape == (
-            4,
-            35 + known,
-        )  # exact: the same parts without their noise
-        assert torch.equal(observations["critic"][:, :35], observations["actor"]) == (
-            "exact" not in chosen
-        )
+        assert obs["critic"].shape == (4, 35 + known)  # exact: the same parts without their noise
+        assert torch.equal(obs["critic"][:, :35], obs["actor"]) == ("exact" not in chosen)
     with raises(ConfigError, match=r"ppo\.privileged has 'velocity'; .*payload_velocity"):
         replace(e.ppo, privileged=("velocity",))
 

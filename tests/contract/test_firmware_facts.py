@@ -92,7 +92,7 @@ def offences(text: str, choices: set[str]) -> list[str]:
         option = isinstance(node, ast.keyword) and node.arg == "default"
         if ours or option or isinstance(node, ast.AnnAssign):
             free |= {id(part) for part in ast.walk(node)}
-    found = []
+    missing = []
     for node in ast.walk(tree):
         if not isinstance(node, ast.Constant) or isinstance(node.value, bool):
             continue
@@ -100,8 +100,8 @@ def offences(text: str, choices: set[str]) -> list[str]:
         number = isinstance(value, int | float) and abs(value) not in PLAIN and id(node) not in free
         named = isinstance(value, str) and PARAMETER.fullmatch(value)
         if number or (named and not MESSAGES.fullmatch(value) and not has_row(value)):
-            found.append(f"{node.lineno}: {value!r}")
-    return found
+            missing.append(f"{node.lineno}: {value!r}")
+    return missing
 
 
 @mark.parametrize("path", PATHS)

@@ -45,9 +45,9 @@ RUNS = {
 def test_any_run_replays_bit_for_bit(name, tmp_path):
     folder = tmp_path / "run"
     record_run(folder, "policy=vision", "observe=true", *QUICK, **RUNS[name])
-    found = replay(folder)
-    assert found["differences"] == []
-    assert found["actions"] > 30
+    replayed = replay(folder)
+    assert replayed["differences"] == []
+    assert replayed["actions"] > 30
 
 
 def test_a_run_whose_policy_failed_replays(tmp_path):
@@ -61,6 +61,6 @@ def test_a_run_whose_policy_failed_replays(tmp_path):
         seconds=3.0,
         close=False,
     )
-    found = replay(tmp_path / "a")
-    assert found["differences"] == []
+    replayed = replay(tmp_path / "a")
+    assert replayed["differences"] == []
     assert "fence" in list(lines(tmp_path / "a" / "ticks.jsonl"))[-1]["reason"]

@@ -44,10 +44,10 @@ def problems(text: str, kernel: ast.FunctionDef) -> list[str]:
         for line, word in sorted(comments.items())
         if first < line < last and word in GROUPS
     ]
-    found = [word for _, word in headings]
+    present = [word for _, word in headings]
     wrong = []
-    if found != sorted(set(found), key=GROUPS.index):
-        wrong.append(f"headings stand as {found}; expected an ordered choice of {list(GROUPS)}")
+    if present != sorted(set(present), key=GROUPS.index):
+        wrong.append(f"headings stand as {present}; expected an ordered choice of {list(GROUPS)}")
     if not headings or headings[0][0] > arguments[0].lineno:
         wrong.append(f"argument '{arguments[0].arg}' stands under no heading")
     for (line, word), (following, _) in zip(headings, [*headings[1:], (last, "")]):
@@ -111,9 +111,9 @@ def test_kernels_are_compiled_alike_in_all_processes():
         for package in ("camera", "sim", "visthrow", "hil")
         for path in (ROOT / package).rglob("*.py")
     ]
-    found = {
+    setters = {
         path.relative_to(ROOT).as_posix()
         for path in files
         if settings(path.read_text(encoding="utf-8"))
     }
-    assert found == {"camera/warp_start.py"}
+    assert setters == {"camera/warp_start.py"}

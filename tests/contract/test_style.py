@@ -95,7 +95,7 @@ def long_functions(text: str) -> list[tuple[str, int]]:
     ]
     plain = [n for n in functions if not any(warp(inner) for inner in ast.walk(n))]
     lines = [(n.name, n.end_lineno - n.lineno + 1) for n in plain]
-    return [found for found in lines if found[1] > LONGEST]
+    return [function for function in lines if function[1] > LONGEST]
 
 
 def left(entry: Path) -> bool:

@@ -60,7 +60,7 @@ def test_no_machine_paths():
             continue
         text = path.read_text(encoding="utf-8")
         wrong += [
-            f"{name}: {text[found.start() :][:120]}" for found in MACHINE_PATHS.finditer(text)
+            f"{name}: {text[match.start() :][:120]}" for match in MACHINE_PATHS.finditer(text)
         ]
     assert not wrong
 

@@ -17,7 +17,7 @@ KINDS = (
 
 def cells(kind, group):
     """Return a row's cells: found, names right up to class, exact, more names than causes."""
-    given, right, exact, found = np.sum([ledger.names(w) for w in group], axis=0)
+    given, right, exact, hits = np.sum([ledger.names(w) for w in group], axis=0)
     hidden = sum(len(ledger.truth_of(w)) for w in group)
     more = sum(ledger.names(w)[0] > len(ledger.truth_of(w)) for w in group)
     if kind == "law":
@@ -31,7 +31,7 @@ def cells(kind, group):
     if not hidden:
         return ["-", f"NO EFFECT in {sum(w['overall'] == 'NO EFFECT' for w in group)}", "-", more]
     total = f" of {hidden}" if kind in ("2x12", "3x12") else ""
-    return [f"{found}{total}", f"{right} of {given}", exact, more]
+    return [f"{hits}{total}", f"{right} of {given}", exact, more]
 
 
 def test_the_record_says_what_the_shipped_ledger_says():

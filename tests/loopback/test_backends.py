@@ -34,8 +34,8 @@ class Desk:
     """A back-end without a runner, which the test queries and commands."""
 
     def __init__(self, kind, *overrides, **options):
-        found = peers(LevelPlant(), kind=kind, loaded=AT_ONCE, overrides=overrides, **options)
-        self.runner, self.source, self.clock, self.fake = found
+        parts = peers(LevelPlant(), kind=kind, loaded=AT_ONCE, overrides=overrides, **options)
+        self.runner, self.source, self.clock, self.fake = parts
         self.backend = self.runner.backend
 
     @property
@@ -391,11 +391,11 @@ def test_px4_in_software_has_no_minimum_of_an_output():
 
 def test_parameters_of_the_config_are_audited_and_written():
     """They make a vehicle in software the policy's."""
-    overrides, found = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
-    desk = Desk("px4", *overrides, parameters=found)
+    overrides, values = ("px4.parameters.SIH_MASS=0.272",), {"SIH_MASS": 1.0}
+    desk = Desk("px4", *overrides, parameters=values)
     desk.turn(0.5)
     assert desk.backend.audit.problems == ["SIH_MASS is 1; expected 0.272"]
-    desk = Desk("px4", *overrides, parameters=found, write=True)
+    desk = Desk("px4", *overrides, parameters=values, write=True)
     desk.turn(3.0)
     assert desk.status.fault is None
     assert desk.fake.parameters["SIH_MASS"] == approx(0.272)
@@ -587,8 +587,8 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
         for pose in desk.source.poll(desk.now):
             desk.runner.tracks[pose.body].update(pose)
         check.tick(desk.now, desk.runner)
-    found, text = check.results(desk.now, desk.runner.mass)[-1]
-    assert found == good, text
+    passed, text = check.results(desk.now, desk.runner.mass)[-1]
+    assert passed == good, text
     assert check.meter.share == approx(hover, rel=0.01)
     desk.turn(1.0)
     if good:

@@ -131,10 +131,10 @@ def twice(monkeypatch):
     original = Terminal.words
 
     def words(terminal, state):
-        found = original(terminal, state)
-        if found.abort and state == "abort":
+        typed = original(terminal, state)
+        if typed.abort and state == "abort":
             os.kill(os.getpid(), signal.SIGINT)
-        return found
+        return typed
 
     monkeypatch.setattr(Terminal, "words", words)
 

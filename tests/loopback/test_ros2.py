@@ -65,19 +65,19 @@ def test_poses_come_from_another_process():
         MocapParams("ros2", "127.0.0.1", settings={"domain": DOMAIN}), bodies, time.monotonic
     )
     other = subprocess.Popen([sys.executable, "-c", PUBLISHER, DOMAIN])
-    found, end = {}, time.monotonic() + 20.0
+    poses, end = {}, time.monotonic() + 20.0
     try:
-        while len(found) < 3 and time.monotonic() < end and other.poll() is None:
+        while len(poses) < 3 and time.monotonic() < end and other.poll() is None:
             for pose in source.poll(time.monotonic()):
-                found.setdefault(pose.body, pose)
+                poses.setdefault(pose.body, pose)
             time.sleep(0.01)
     finally:
         other.kill()
         other.wait()
         source.close()
-    assert set(found) == {"vehicle", "payload", "goal"}
+    assert set(poses) == {"vehicle", "payload", "goal"}
     for body, first in (("vehicle", 1.0), ("payload", 1.0), ("goal", 5.0)):
-        pose = found[body]
+        pose = poses[body]
         n = round(pose.stamp - 1000.25)
         assert pose.stamp == 1000.25 + n
         assert pose.pos[0] == first + n

@@ -56,8 +56,8 @@ def converged() -> Flight:
 
 def off_converged(solver: str, substep: float) -> float:
     """How far a solver ends the hard throw from the fused chain's converged run [m]."""
-    found, truth = fly(SCENE, substep, "float32", 0.02, solver), converged()
-    ball, vehicle = norm(found.ball_pos_w - truth.ball_pos_w), norm(found.pos_w - truth.pos_w)
+    end, truth = fly(SCENE, substep, "float32", 0.02, solver), converged()
+    ball, vehicle = norm(end.ball_pos_w - truth.ball_pos_w), norm(end.pos_w - truth.pos_w)
     return max(float(ball), float(vehicle))
 
 
@@ -285,13 +285,13 @@ def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
     level = np.array([[0.0, 0.0, 0.0, 1.0]])
     exact = changed(on(plant, "chain", 5e-4), {"sim.precision": "float64"})
     chain = HybridSim(exact, 1, extensions=EVERYTHING)
-    found = []
+    velocities = []
     for sim in (chain, HybridSim(on(plant, "mujoco_warp", 5e-4), 1)):
         sim.place(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)), direction, rate)
         for _ in range(5):
             sim.step()
-        found.append(sim.get("payload_vel_w"))
-    assert_allclose(found[1], found[0], atol=0.01)
+        velocities.append(sim.get("payload_vel_w"))
+    assert_allclose(velocities[1], velocities[0], atol=0.01)
 
 
 def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch):

@@ -115,9 +115,9 @@ def blocks_of(page: Path, root: Path = ROOT) -> list[Block]:
             :data:`REASONS`, an unknown comment.
     """
     text, name = page.read_text(encoding="utf-8"), page.relative_to(root).as_posix()
-    if found := re.search(r"^[ \t>]+```", text, re.MULTILINE):
+    if indented := re.search(r"^[ \t>]+```", text, re.MULTILINE):
         raise ValueError(
-            f"{name}: a fence that is indented is not found: {text[found.start() :][:60]!r}"
+            f"{name}: a fence that is indented is not found: {text[indented.start() :][:60]!r}"
         )
     blocks = []
     for match in FENCE.finditer(text):
@@ -319,12 +319,12 @@ def _environment() -> dict[str, str]:
 
 
 def _globbed(word: str) -> list[str]:
-    found = (
+    paths = (
         []
         if Path(word).is_absolute() or not set("*[?") & set(word)
         else sorted(map(str, Path().glob(word)))
     )
-    return found or [word]
+    return paths or [word]
 
 
 def _files() -> set[tuple[str, int]]:

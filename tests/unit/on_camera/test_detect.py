@@ -74,9 +74,11 @@ def off(detected: FrameDetections) -> np.ndarray:
     """How far the keypoints are from the true ones [px], shape (8,)."""
     true, valid = keypoints(CAMERA, POS, ROT, GOAL, BALL)
     assert valid.all()
-    found, ok = convert_to_training_keypoints(CAMERA, detected, ROT[0].numpy())
+    detected_points, ok = convert_to_training_keypoints(CAMERA, detected, ROT[0].numpy())
     assert ok.all()
-    pixels = [CAMERA.fisheye.denormalize(points.double()).numpy() for points in (found, true[0])]
+    pixels = [
+        CAMERA.fisheye.denormalize(points.double()).numpy() for points in (detected_points, true[0])
+    ]
     return norm(pixels[0] - pixels[1], axis=1)
 
 
@@ -141,7 +143,7 @@ def test_what_only_resembles_them_is_refused(cluttered):
 
 
 def test_known_things_narrow_the_search(scene):
-    found = DETECTOR.detect(scene)
+    detected = DETECTOR.detect(scene)
     for wrong in (
         replace(known(), ball_distance=(1.0, 2.0)),
         replace(known(), ball_ray_c=np.array([0.0, 0.8, 0.6])),
@@ -149,7 +151,7 @@ def test_known_things_narrow_the_search(scene):
         assert DETECTOR.detect(scene, wrong).ball is None
     high = replace(known(), height=2.6)
     assert DETECTOR.detect(scene, high).goal is None, "a square of twice the size"
-    assert DETECTOR.detect(scene, replace(known(), ball_ray_c=found.ball.ray_c)).ball is not None
+    assert DETECTOR.detect(scene, replace(known(), ball_ray_c=detected.ball.ray_c)).ball is not None
 
 
 def test_a_rounder_ball_scores_higher():

@@ -97,8 +97,8 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
 def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_path, printed):
     out = tmp_path / "mine.toml"
     theta = {"battery_charge": 0.04, "thrust_gain": 0.03}
-    found = diagnosis(theta=theta, covariance=[[1e-4, 9e-5], [9e-5, 4e-4]])
-    output = printed(f"diagnose apply {found} --out {out}")
+    path = diagnosis(theta=theta, covariance=[[1e-4, 9e-5], [9e-5, 4e-4]])
+    output = printed(f"diagnose apply {path} --out {out}")
     assert "Not written: battery_charge" in output
     assert "Not written: battery_charge" in out.read_text()
     after = load_experiment(out)
@@ -119,7 +119,7 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refu
     """
     quick, out = tmp_path / "quick.toml", tmp_path / "mended.toml"
     quick.write_text('base = "train/state.toml"\n[release]\nlag = 0.08\n')
-    found = {
+    sizes = {
         "theta": {"release_lag": 0.03},
         "covariance": [[1e-6]],
         "overrides": ["rope.length=0.5"],
@@ -128,10 +128,10 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refu
         (str(quick), "--plant state", "do not count from state"),
         (None, "", "names no plant"),
     ):
-        report = diagnosis(plant=plant, **found)
+        report = diagnosis(plant=plant, **sizes)
         refused(f"diagnose apply {report} {option} --out {out}", message=message)
     assert not out.exists()
-    assert run_command(f"diagnose apply {diagnosis(plant=str(quick), **found)} --out {out}") == 0
+    assert run_command(f"diagnose apply {diagnosis(plant=str(quick), **sizes)} --out {out}") == 0
     after = load_experiment(out)
     assert (after.release.lag, after.rope.length) == approx((0.11, 0.5))
 

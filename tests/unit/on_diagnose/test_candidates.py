@@ -64,10 +64,10 @@ class Levered(SyntheticModel):
 
     def windows(self, theta):
         mask = np.arange(len(EFFECTS)) == self.by
-        found = zip(super().windows(theta), self.residuals(theta))
+        pairs = zip(super().windows(theta), self.residuals(theta))
         return [
             replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * mask)
-            for w, r in found
+            for w, r in pairs
         ]
 
     def residuals(self, theta, about=None):
@@ -135,8 +135,8 @@ class Spoiled(SyntheticModel):
         return [r + noise if i == BAD else r for i, r in enumerate(residuals)]
 
     def windows(self, theta):
-        found = super().windows(theta)
-        return [replace(w, shaken=self.shaken and i == BAD) for i, w in enumerate(found)]
+        inherited = super().windows(theta)
+        return [replace(w, shaken=self.shaken and i == BAD) for i, w in enumerate(inherited)]
 
     def residuals(self, theta, about=None):
         return self._spoilt(theta, super().residuals(theta, about))
@@ -153,13 +153,11 @@ def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected)
 
 
 def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():
-    messages = []
+    lines = []
     model = Spoiled(truth={"effect_00": 15.0}, throws=8, seed=4)
     model.rough, model.beyond = 4.0, 5.0
-    diagnosis = diagnose_flights.explain(model, laws=False, progress=messages.append)
-    assert (
-        sum("are left out, which the simulation does not follow" in line for line in messages) == 1
-    )
+    diagnosis = diagnose_flights.explain(model, laws=False, progress=lines.append)
+    assert sum("are left out, which the simulation does not follow" in line for line in lines) == 1
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)
     count = len(model.windows({}))

@@ -58,12 +58,12 @@ def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
         aim.nats(aim.information(s.model)) / m.seconds for m, s in zip(chosen, simulate(chosen))
     ]
     best = chosen[int(np.argmax(rates))]
-    found = design.optimise(aim, best, simulate, design.Limits(), seed=1, steps=0)
-    assert found.start == approx(max(rates), rel=0.02)  # but for the noise
-    assert found.rate > 1.15 * found.start
-    (again,) = simulate([found.manoeuvre])
+    optimum = design.optimise(aim, best, simulate, design.Limits(), seed=1, steps=0)
+    assert optimum.start == approx(max(rates), rel=0.02)  # but for the noise
+    assert optimum.rate > 1.15 * optimum.start
+    (again,) = simulate([optimum.manoeuvre])
     assert again.used < 1.0
-    assert aim.nats(aim.information(again.model)) / best.seconds == approx(found.rate, rel=0.02)
+    assert aim.nats(aim.information(again.model)) / best.seconds == approx(optimum.rate, rel=0.02)
 
 
 @mark.parametrize("base", BASES.values(), ids=lambda m: m.name)

@@ -224,7 +224,7 @@ def test_several_forms_at_once_are_another_form(monkeypatch):
     forms = tuple(replace(form, name=f"effect_{i:02d}_by_flight") for i in (1, 4))
     overall = []
     for count in (1, 2):
-        found = forms[:count], {}
-        monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, found=found: found)
+        shares = forms[:count], {}
+        monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, shares=shares: shares)
         overall.append(explain_without_laws(world({"effect_05": 40.0})).overall)
     assert overall == [result.KNOWN, result.UNKNOWN]

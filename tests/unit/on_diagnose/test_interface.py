@@ -70,12 +70,12 @@ def changed(log, change):
 @mark.parametrize("name", WRONG)
 def test_each_mistake_is_suspected_and_put_right(logs, name):
     wrong = [changed(log, WRONG[name]) for log in logs]
-    found = suspected(wrong, PLANT)
-    assert [m.name for m in found] == [name.split(" ")[0]]
-    assert found[0].logs == 3
+    mistakes = suspected(wrong, PLANT)
+    assert [m.name for m in mistakes] == [name.split(" ")[0]]
+    assert mistakes[0].logs == 3
     for log, meant in zip(wrong, logs):
         assert_allclose(
-            found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
+            mistakes[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
         )
 
 

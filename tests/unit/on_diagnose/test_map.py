@@ -51,8 +51,8 @@ def units_of(proposal) -> dict[str, str]:
 def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_path):
     """Columns and units of every channel that both have are the same, and the file loads."""
     file = REAL / f"{path}.csv.gz"
-    found = propose(table_of(file), str(file))
-    (tmp_path / "mine.toml").write_text(toml_of(found, file.name))
+    proposal = propose(table_of(file), str(file))
+    (tmp_path / "mine.toml").write_text(toml_of(proposal, file.name))
     mine, shipped = (setup.load(name).table for name in (tmp_path / "mine.toml", SETS[path]))
     ours = {c.name: c for c in shipped.channels}
     common = [c for c in mine.channels if c.name in ours and c.name not in FREE]
@@ -84,9 +84,9 @@ def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
     drawn = {"pos_w": ("m", "mm", "cm"), "rate_b": ("rad/s", "deg/s"), "acc_b": ("m/s^2", "g")}
     for stem, (name, units) in zip(("p", "gyro", "acc"), drawn.items()):
         table |= named(stem, columns[name] * flip / UNITS[rng.choice(units)][1])
-    found = propose(table, "a.csv")
-    assert not found.questions
-    (log,) = logs_of(table, found.mapping, "a.csv")
+    proposal = propose(table, "a.csv")
+    assert not proposal.questions
+    (log,) = logs_of(table, proposal.mapping, "a.csv")
     for name in drawn:
         assert log[name].values == approx(columns[name], rel=1e-6, abs=1e-6)
     assert np.abs(np.sum(log["quat_wb"].values * columns["quat_wb"], axis=1)) == approx(1.0)
@@ -98,13 +98,15 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     thrust = columns["command"][:, 0]
     table = flown_by_motors(columns, thrust, "motor") | named("acc", columns["acc_b"])
     other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
-    found = propose(table | {"thrust": other}, "a.csv")
-    assert found.flyer["input"] == "motor_command"
+    proposal = propose(table | {"thrust": other}, "a.csv")
+    assert proposal.flyer["input"] == "motor_command"
     hover = 0.01 * np.median(thrust)  # read as per cent; four of them carry the vehicle
-    lift = 4.0 * found.flyer["thrust_map"][1] * hover
-    assert lift == approx(9.81 * found.flyer["mass"], rel=0.1)
-    assert found.flyer["drag_xy"] == approx(0.3 * found.flyer["mass"], rel=0.05)  # or no wind acts
-    assert asks(found, "The force follows 'motor_command' best")
+    lift = 4.0 * proposal.flyer["thrust_map"][1] * hover
+    assert lift == approx(9.81 * proposal.flyer["mass"], rel=0.1)
+    assert proposal.flyer["drag_xy"] == approx(
+        0.3 * proposal.flyer["mass"], rel=0.05
+    )  # or no wind acts
+    assert asks(proposal, "The force follows 'motor_command' best")
 
 
 def test_a_marker_in_millimetres_is_no_velocity_of_another():
@@ -167,8 +169,8 @@ def test_a_column_is_found_under_another_laboratorys_name(thrust, load, names):
     table |= {f"{a}_sp": 100.0 + c for a, c in zip("xyz", path.T)}
     pos, angles, rates, acc, vel = (" ".join(part) for part in np.reshape(names.split(), (5, 3)))
     hung = {f"{load}{a}": c for a, c in zip("xyz", 1e3 * (columns["pos_w"] + below).T)}
-    found = propose(table | hung, "a.csv", mass=0.15)
-    made = {c.name: (" ".join(c.columns), c.unit) for c in found.mapping.channels}
+    proposal = propose(table | hung, "a.csv", mass=0.15)
+    made = {c.name: (" ".join(c.columns), c.unit) for c in proposal.mapping.channels}
     assert made == {
         "pos_w": (pos, "mm"),
         "vel_w": (vel, "mm/s"),
@@ -178,7 +180,7 @@ def test_a_column_is_found_under_another_laboratorys_name(thrust, load, names):
         "acc_b": (acc, "m/s^2"),
         "thrust_command": (thrust, "N"),
     }
-    assert found.flyer["cable"]["length"] == approx(0.5, abs=0.01)
+    assert proposal.flyer["cable"]["length"] == approx(0.5, abs=0.01)
     (question,) = propose(table, "a.csv", mass=0.15).questions
     assert "does a load hang below?" in question
 
@@ -198,9 +200,9 @@ def test_a_thrust_goes_before_a_temperature_and_a_vehicle_before_its_ball():
 @pytest.mark.parametrize(("reach", "unit"), [(40.0, "deg"), (0.6, "rad")])
 def test_an_angle_is_in_the_unit_of_its_reach(reach, unit):
     time = 0.01 * np.arange(500)
-    found = propose({"time": time, "theta": reach * np.sin(time)}, "a.csv")
-    assert [(c.name, c.unit) for c in found.mapping.channels] == [("angle", unit)]
-    assert "deg or rad?" in found.questions[0]
+    proposal = propose({"time": time, "theta": reach * np.sin(time)}, "a.csv")
+    assert [(c.name, c.unit) for c in proposal.mapping.channels] == [("angle", unit)]
+    assert "deg or rad?" in proposal.questions[0]
 
 
 def test_the_imu_of_euroc_is_proposed():
@@ -209,8 +211,8 @@ def test_the_imu_of_euroc_is_proposed():
     for stem, unit, name in (("w", "rad s^-1", "rate_b"), ("a", "m s^-2", "acc_b")):
         axes = zip("xyz", columns[name].T)
         table |= {f"{stem}_RS_S_{axis} [{unit}]": column for axis, column in axes}
-    found = propose(table, "data.csv").mapping
-    assert {"rate_b", "acc_b"} <= {channel.name for channel in found.channels}
+    proposal = propose(table, "data.csv").mapping
+    assert {"rate_b", "acc_b"} <= {channel.name for channel in proposal.channels}
 
 
 def test_rows_that_share_a_stamp_have_a_clock():
@@ -221,8 +223,8 @@ def test_rows_that_share_a_stamp_have_a_clock():
 
 def test_an_unknown_number_becomes_a_question(tmp_path):
     columns = flight(20.0)
-    found = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")
-    assert asks(found, "how far are the rows apart")
+    proposal = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")
+    assert asks(proposal, "how far are the rows apart")
     with raises(LogError, match="none of its 2 columns holds numbers that change"):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
     with raises(LogError, match=r"a\.ulg: describes its own contents"):
@@ -253,25 +255,25 @@ def test_metres_with_radians_differ_from_centimetres_with_degrees_or_become_a_qu
     of the lean.
     """
     for units in (("cm", "deg"), ("m", "rad")):
-        found = propose(unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv")
-        made = units_of(found)
-        questions = "".join(found.questions)
+        proposal = propose(unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv")
+        made = units_of(proposal)
+        questions = "".join(proposal.questions)
         assert made == {"pos_w": units[0], "quat_wb": units[1]} or "with deg would do" in questions
 
 
 def test_angles_that_would_turn_a_flight_over_are_in_degrees():
-    found = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
-    assert units_of(found) == {"pos_w": "mm", "quat_wb": "deg"}
-    assert "deg, axes x,y,z by gravity" in found.why["quat_wb"]
-    assert not found.questions
+    proposal = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
+    assert units_of(proposal) == {"pos_w": "mm", "quat_wb": "deg"}
+    assert "deg, axes x,y,z by gravity" in proposal.why["quat_wb"]
+    assert not proposal.questions
 
 
 def test_what_falls_says_its_unit_and_a_hall_what_it_can():
     throws = table_of(REAL / "jugglebot_throws" / "session7.csv.gz")
     bare = {name.removesuffix("_mm"): cells for name, cells in throws.items()}
-    found = propose(bare, "a.csv")
-    assert [(c.name, c.unit) for c in found.mapping.channels] == [("pos_w", "mm")]
-    assert "falls freely" in found.why["pos_w"]
+    proposal = propose(bare, "a.csv")
+    assert [(c.name, c.unit) for c in proposal.mapping.channels] == [("pos_w", "mm")]
+    assert "falls freely" in proposal.why["pos_w"]
     slow = {"time": 0.01 * np.arange(2000)}
     for reach, unit, is_question in (
         (3.0, "m", False),
@@ -280,11 +282,11 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
         (3e6, "m", True),
     ):
         sway = reach * np.sin(0.2 * slow["time"])
-        found = propose(
+        proposal = propose(
             slow | named("pos", np.column_stack([sway, 0.5 * sway, 0.2 * sway])), "a.csv"
         )
-        assert found.mapping.channels[0].unit == unit
-        assert asks(found, f"'{unit}' is a guess") == is_question
+        assert proposal.mapping.channels[0].unit == unit
+        assert asks(proposal, f"'{unit}' is a guess") == is_question
 
 
 def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
@@ -293,10 +295,10 @@ def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
     path = 0.5 * np.sin(np.outer(0.01 * rows, [1.9, 2.3, 1.1]))
     speed = np.gradient(path, 0.01, axis=0)
     columns = {"time[ms]": 1e4 * rows, **named("pos", path), **named("vel", speed)}
-    found = propose(columns, "a.csv")
-    assert found.mapping.time.unit == "us"
-    assert found.mapping.entry("vel_w").unit == "m/s"
-    assert asks(found, "fits the units us; 'us' is a guess")
+    proposal = propose(columns, "a.csv")
+    assert proposal.mapping.time.unit == "us"
+    assert proposal.mapping.entry("vel_w").unit == "m/s"
+    assert asks(proposal, "fits the units us; 'us' is a guess")
     assert propose(columns, "a.csv", time_unit="ms").mapping.time.unit == "ms"
 
 
@@ -310,14 +312,14 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
         ),
     ):
         propose(table_of(file), file.name, mass=36.9)
-    found = propose(table_of(file), file.name, mass=0.0369)
-    assert "N by the mass: it carries 0.04077 kg" in found.why["thrust_command"]
-    assert not asks(found, "thrust")
+    proposal = propose(table_of(file), file.name, mass=0.0369)
+    assert "N by the mass: it carries 0.04077 kg" in proposal.why["thrust_command"]
+    assert not asks(proposal, "thrust")
     grams = table_of(file)
     grams["ctrlLee.thrustSI"] = grams["ctrlLee.thrustSI"] / UNITS["gf"][1]
-    found = propose(grams, file.name, mass=0.0369)
-    assert units_of(found)["thrust_command"] == "gf"
-    assert found.flyer["thrust_map"] == [0.0, 1.0, 0.0]
+    proposal = propose(grams, file.name, mass=0.0369)
+    assert units_of(proposal)["thrust_command"] == "gf"
+    assert proposal.flyer["thrust_map"] == [0.0, 1.0, 0.0]
     both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
     assert asks(both, "36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?")
     apart = {name: cells for name, cells in table_of(file).items() if not name.startswith("acc")}
@@ -328,8 +330,8 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
 
 def test_a_mass_that_no_data_contradicts_becomes_a_question():
     file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
-    found = propose(table_of(file), file.name, mass=27.0)
-    assert asks(found, "the vehicle weighs 27 kg? Nothing in the log is in newtons")
+    proposal = propose(table_of(file), file.name, mass=27.0)
+    assert asks(proposal, "the vehicle weighs 27 kg? Nothing in the log is in newtons")
     ball = REAL / "jugglebot_throws" / "session7.csv.gz"
     assert asks(propose(table_of(ball), ball.name, mass=0.1), "--mass is not used")
 
@@ -438,12 +440,12 @@ def test_an_accelerometer_says_which_column_of_a_quaternion_is_w():
     table = {"time": columns["time"], "q0": w, "q1": x, "q2": -y, "q3": -z}
     table |= named("acc_b", acc) | named("ang_acc_b", np.gradient(rates, axis=0))
     table |= named("angular_velocity", rates)
-    found = {channel.name: channel for channel in propose(table, "a.csv").mapping.channels}
-    attitude = found["quat_wb"]
+    channels = {channel.name: channel for channel in propose(table, "a.csv").mapping.channels}
+    attitude = channels["quat_wb"]
     assert (attitude.order, attitude.axes, attitude.body_axes) == ("wxyz", "x,-y,-z", "x,-y,-z")
-    assert found["acc_b"].axes == found["rate_b"].axes == "x,-y,-z"
-    assert "pos_w" not in found
-    assert found["rate_b"].unit == "rad/s"
+    assert channels["acc_b"].axes == channels["rate_b"].axes == "x,-y,-z"
+    assert "pos_w" not in channels
+    assert channels["rate_b"].unit == "rad/s"
 
 
 def test_an_attitude_that_comes_too_seldom_is_refused_by_its_period():
@@ -472,13 +474,13 @@ def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     share = columns["command"][:, 0] / np.max(columns["command"][:, 0])
     motors = counts(share) if counts is not None else 1000.0 + 900.0 * share
     table = flown_by_motors(columns, motors, name)
-    found = propose(table, "a.csv", mass=0.2)
-    (log,) = logs_of(table, found.mapping, "a.csv")
-    inputs = log[found.flyer["input"]].values
-    thrust = np.polynomial.polynomial.polyval(inputs, found.flyer["thrust_map"]).sum(axis=1)
+    proposal = propose(table, "a.csv", mass=0.2)
+    (log,) = logs_of(table, proposal.mapping, "a.csv")
+    inputs = log[proposal.flyer["input"]].values
+    thrust = np.polynomial.polynomial.polyval(inputs, proposal.flyer["thrust_map"]).sum(axis=1)
     assert np.median(thrust) == approx(0.2 * 9.81, rel=0.1)
     assert thrust / np.median(thrust) == approx(share / np.median(share), rel=1e-3)
-    assert found.flyer["motor_time_constant"] == tau
+    assert proposal.flyer["motor_time_constant"] == tau
 
 
 def test_outputs_without_a_motor_are_left_out_and_a_flaps_output_becomes_a_question():
@@ -491,9 +493,9 @@ def test_outputs_without_a_motor_are_left_out_and_a_flaps_output_becomes_a_quest
     assert entry.columns == tuple(f"actuator_outputs[{i}]" for i in range(4))
     for i in (4, 5):
         table[f"actuator_outputs[{i}]"] = 1500.0 + 100.0 * np.sin(i * columns["time"])
-    found = propose(table, "a.csv")
-    assert found.mapping.entry("motor_command") is None
-    assert asks(found, "which four of actuator_outputs[0]")
+    proposal = propose(table, "a.csv")
+    assert proposal.mapping.entry("motor_command") is None
+    assert asks(proposal, "which four of actuator_outputs[0]")
 
 
 def test_a_flag_is_no_number_of_a_flight():
@@ -502,8 +504,8 @@ def test_a_flag_is_no_number_of_a_flight():
     half = np.arange(len(columns["time"])) % 7 == 0
     table |= {"data_valid": half.astype(float), "tracking_valid": half.astype(float)}
     assert not asks(propose(table, "a.csv"), "[table.split]")
-    found = propose(table | {"flight_id": half.astype(float)}, "a.csv")
-    assert asks(found, "'flight_id' has 2 values")
+    proposal = propose(table | {"flight_id": half.astype(float)}, "a.csv")
+    assert asks(proposal, "'flight_id' has 2 values")
 
 
 def test_a_thrust_in_shares_of_the_full_one_is_doubted():
@@ -511,5 +513,5 @@ def test_a_thrust_in_shares_of_the_full_one_is_doubted():
     columns = flight(20.0)
     table = flown_by_motors(columns, 0.7 + 0.0 * columns["time"], "motor")
     table["hover_thrust"] = 0.32 * columns["command"][:, 0]
-    found = propose(table, "a.csv", mass=0.9)
-    assert asks(found, "or a share of the full thrust?")
+    proposal = propose(table, "a.csv", mass=0.9)
+    assert asks(proposal, "or a share of the full thrust?")

@@ -113,8 +113,8 @@ def test_noise_levels_are_found_again(sensor, gust):
     windows = model.windows({})
     levels, _ = noise.fit(windows, [marginal.gram_of(w, np.ones(6), 2) for w in windows])
     assert_allclose(levels.scale, sensor, rtol=0.1)
-    found = np.mean([levels.latent_sd[0, p] for p in ("flight", "hover", "throw")])
-    assert found == approx(gust * GUST[0], rel=0.5)
+    mean_gust = np.mean([levels.latent_sd[0, p] for p in ("flight", "hover", "throw")])
+    assert mean_gust == approx(gust * GUST[0], rel=0.5)
 
 
 def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted):

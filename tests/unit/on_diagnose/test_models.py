@@ -69,7 +69,7 @@ TORQUE = TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.
 IMU = ImuParams(**QUADROTOR, step=0.01, torque=TORQUE)
 
 
-def found(model, names) -> dict[str, tuple[float, float]]:
+def estimate(model, names) -> dict[str, tuple[float, float]]:
     """Estimates and deviations."""
     result = fitting.fit(model, names)
     return {
@@ -87,7 +87,7 @@ class TestBall:
     def test_what_flies_is_found(self):
         logs = [ball_log(drag=0.04, seed=i, heading=2.1 * i) for i in range(4)]
         assert len(BallModel(logs, BALL).stretches) == 4
-        estimates = found(
+        estimates = estimate(
             BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"]
         )
         assert estimates["ball_drag"][0] == approx(0.04, rel=0.03)
@@ -96,7 +96,7 @@ class TestBall:
 
     def test_spin_is_found(self):
         logs = [ball_log(spin=(0.0, 0.0, 0.3), seed=i, heading=2.1 * i) for i in range(3)]
-        estimates = found(BallModel(logs, BALL), ["side_spin", "ball_drag"])
+        estimates = estimate(BallModel(logs, BALL), ["side_spin", "ball_drag"])
         assert estimates["side_spin"][0] == approx(0.3, rel=0.05)
 
     def test_wind_shows_where_the_drag_is(self):
@@ -277,18 +277,18 @@ class TestFlyer:
         model.effects = measures.narrowed(model.effects, measures.parsed(stated))
         if stated:
             model.choose(["wind_x", "wind_y"])  # nothing else may take their place
-        found = explain_without_laws(model)
-        named = {f.name for f in found.findings if f.verdict in result.NAMED}
+        diagnosis = explain_without_laws(model)
+        named = {f.name for f in diagnosis.findings if f.verdict in result.NAMED}
         assert stated or not named & {"frame_tilt_y", "marker_rot_y"}
         assert ("wind_x" in named) != bool(stated)
 
     def test_wind_and_tilt_are_one_class_where_their_forms_hardly_differ(self, monkeypatch):
         """A tilt that is strongly behind, but by a small part of what the wind is worth."""
         model = self.in_wind(monkeypatch, 0.3, drag=0.01, wind=4.0, beat=0.01, noise=2e-3)
-        found = explain_without_laws(model)
-        assert found["wind_x"].verdict == found["frame_tilt_y"].verdict == result.CLASS
-        assert found["wind_x"].estimate == approx(4.0, rel=0.1)
-        assert "frame_tilt_y" in found["wind_x"].partners
+        diagnosis = explain_without_laws(model)
+        assert diagnosis["wind_x"].verdict == diagnosis["frame_tilt_y"].verdict == result.CLASS
+        assert diagnosis["wind_x"].estimate == approx(4.0, rel=0.1)
+        assert "frame_tilt_y" in diagnosis["wind_x"].partners
 
     def test_another_of_a_group_is_simulated_however_little_it_promises(self, monkeypatch):
         model = self.in_wind(monkeypatch, 0.3, drag=0.01, wind=4.0, noise=2e-3)
@@ -467,10 +467,10 @@ class TestImu:
         logs = self.logs(0.2, (0.3, -0.2))
         model = ImuModel(logs, IMU)
         fitted = fitting.fit(model, [*fitting.DEFAULT_FREE["imu"]])
-        found = dict(zip(fitted.names, fitted.theta))
+        sizes_fitted = dict(zip(fitted.names, fitted.theta))
         sd = dict(zip(fitted.names, np.sqrt(np.diag(fitted.covariance))))
         for name, size in truth.items():
-            assert abs(found[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
+            assert abs(sizes_fitted[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
             assert sd[name] < 0.15 * abs(size), name
 
     def test_without_torques_the_accelerometer_alone_tells_the_motors_lag(self):
@@ -533,8 +533,8 @@ class TestSetups:
 
     def test_a_simulated_vehicle_gets_what_a_flight_showed(self):
         sizes = {"motor_tau": 0.007, "mass_quad": 0.01, "rotor_drag_xy": 0.02}
-        found = SimpleNamespace(names=tuple(sizes), theta=np.array(list(sizes.values())))
-        vehicle = fitting.vehicle_of(setups.Setup("", flyer=FLYER), found, paper_plant().vehicle)
+        fitted = SimpleNamespace(names=tuple(sizes), theta=np.array(list(sizes.values())))
+        vehicle = fitting.vehicle_of(setups.Setup("", flyer=FLYER), fitted, paper_plant().vehicle)
         assert vehicle.motor.time_constant == approx(FLYER.motor_time_constant + 0.007)
         assert vehicle.body.mass == approx(FLYER.mass + 0.01)
         assert vehicle.aero.drag_x == vehicle.aero.drag_y == approx(FLYER.drag_xy + 0.02)

@@ -164,8 +164,8 @@ WRITERS = {
 def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
-    found = propose(table_of(path), name)
-    (log,) = read(path, found.mapping)
+    proposal = propose(table_of(path), name)
+    (log,) = read(path, proposal.mapping)
     assert {"pos_w", "acc_b"} <= set(log.channels)
     every = 2 if name in ("log00", "log01", "a.mcap") else 1
     assert log["pos_w"].values == approx(
@@ -173,7 +173,7 @@ def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     )
     assert log["acc_b"].values == approx(COLUMNS["acc_b"], abs=1e-4)
     assert np.median(np.diff(log["pos_w"].time)) == approx(0.01 * every, rel=1e-3)
-    assert (found.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), (
+    assert (proposal.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), (
         "tables with clocks of their own"
     )
     with raises(LogError, match="needs a mapping"):

@@ -53,12 +53,12 @@ class Throwing(SyntheticModel):
 
 
 @fixture(scope="module")
-def found():
+def diagnosed():
     model = Throwing(truth=TRUTH, seed=1)
     return model, explain_without_laws(model)
 
 
-def test_landings_are_reported_in_millimetres(found, measured):
+def test_landings_are_reported_in_millimetres(diagnosed, measured):
     """Before, after with causes sized by the other flights, and by each cause alone; in the text
     too.
     """
@@ -72,27 +72,27 @@ def test_landings_are_reported_in_millimetres(found, measured):
     assert landing.released_before == approx(0.1 * landing.before)
     for name, moved in landing.moved.items():
         assert moved == approx(alone[name], rel=0.2)
-    text = report.summary(found[1], measured)
+    text = report.summary(diagnosed[1], measured)
     assert f"It moves landings by {1e3 * landing.moved['effect_03']:.0f} mm." in text
     assert f"falls from {1e3 * landing.before:.0f} to {1e3 * landing.after:.0f} mm" in text
-    assert report.to_json(found[1], measured)["gain"]["landing"]["after"] == landing.after
+    assert report.to_json(diagnosed[1], measured)["gain"]["landing"]["after"] == landing.after
 
 
 @fixture(scope="module")
-def measured(found):
-    return gain.measure(found[1])
+def measured(diagnosed):
+    return gain.measure(diagnosed[1])
 
 
-def test_flights_without_a_measured_landing_have_no_gain_in_landings(found, monkeypatch):
-    model, diagnosis = found
+def test_flights_without_a_measured_landing_have_no_gain_in_landings(diagnosed, monkeypatch):
+    model, diagnosis = diagnosed
     points = np.empty((0, 3))
     nothing = PredictedLandings(np.empty(0, int), points, points, points)
     monkeypatch.setattr(model, "landings", lambda theta, flights: nothing)
     assert gain.measure(diagnosis).landing is None
 
 
-def test_prediction_does_not_look_at_what_it_predicts(found):
-    _, diagnosis = found
+def test_prediction_does_not_look_at_what_it_predicts(diagnosed):
+    _, diagnosis = diagnosed
     point = diagnosis.work.after
     window = point.windows[0]
     late = window.time > window.time.min() + 0.7
@@ -105,8 +105,8 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
 
 
 @fixture(scope="module")
-def hidden(found):
-    return blind.hide(found[1], draws=60)
+def hidden(diagnosed):
+    return blind.hide(diagnosed[1], draws=60)
 
 
 def test_completeness_rises_and_noise_is_not_named(hidden):
@@ -250,9 +250,9 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
 
 
 def test_the_report_holds_sentences_pictures_and_numbers(
-    tmp_path, found, measured, hidden, degenerate
+    tmp_path, diagnosed, measured, hidden, degenerate
 ):
-    _, diagnosis = found
+    _, diagnosis = diagnosed
     made = report.sections(
         diagnosis, measured, hidden, step_check={"pos_w": 0.03}, provenance={"logs": 7}
     )
@@ -282,7 +282,7 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
-def test_terms_that_act_together_are_printed_together(found):
+def test_terms_that_act_together_are_printed_together(diagnosed):
     """A drag is the first explanation here by a pair; the second is one term alone."""
     first = result.Law(
         "vehicle force", ("speed_across_squared",), "vel", 4e-3, "F = c v_xy² v", 1e-4, "kg", 20.0
@@ -291,7 +291,7 @@ def test_terms_that_act_together_are_printed_together(found):
     alone = replace(first, formula="F = c |v| v", coefficient=-2e-3)
     both = ((first, second), (alone,))
     unknown = replace(
-        found[1], overall=result.UNKNOWN, laws=(first, second, alone), explanations=both
+        diagnosed[1], overall=result.UNKNOWN, laws=(first, second, alone), explanations=both
     )
     text = page.markdown_of("", "", report.sections(unknown))
     (line,) = (line for line in text.splitlines() if "**Law.**" in line)
@@ -304,12 +304,12 @@ def test_terms_that_act_together_are_printed_together(found):
     assert len(numbers) == 3
 
 
-def test_where_nothing_was_named_no_error_with_names_is_given(found, measured):
+def test_where_nothing_was_named_no_error_with_names_is_given(diagnosed, measured):
     rows = {}
-    for theta in (found[1].theta, {}):
+    for theta in (diagnosed[1].theta, {}):
         (section,) = (
             s
-            for s in report.sections(replace(found[1], theta=theta, work=None), measured)
+            for s in report.sections(replace(diagnosed[1], theta=theta, work=None), measured)
             if s.title == "Gain on flights that were not used"
         )
         rows[bool(theta)] = section.parts[0].rows[0]
@@ -318,11 +318,13 @@ def test_where_nothing_was_named_no_error_with_names_is_given(found, measured):
     assert rows[False][3:5] == ("-", "-")
 
 
-def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):
+def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(
+    tmp_path, diagnosed, monkeypatch, capsys
+):
     def full(*_):
         raise OSError("no space left")
 
-    model, diagnosis = found
+    model, diagnosis = diagnosed
     monkeypatch.setattr(page, "write", full)
     monkeypatch.setattr(model, "step_error", dict, raising=False)
     with raises(OSError, match="no space"):
@@ -331,10 +333,10 @@ def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, mo
     assert '"KNOWN"' in (tmp_path / explain_cli.DIAGNOSIS).read_text(encoding="utf-8")
 
 
-def test_the_recording_is_written(tmp_path, found):
+def test_the_recording_is_written(tmp_path, diagnosed):
     from visthrow.diagnose.reporting import recording
 
-    recording.write(tmp_path / "d.rrd", found[1], [])
+    recording.write(tmp_path / "d.rrd", diagnosed[1], [])
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
 
 
@@ -370,11 +372,11 @@ def test_mistakes_on_the_command_line_are_reported(
     assert printed.out == "", "before the search"
 
 
-def test_an_event_is_left_out_or_weighs_little(found):
+def test_an_event_is_left_out_or_weighs_little(diagnosed):
     """A flight that was left out has no windows any more; one whose window is far rougher than
     others has.
     """
-    _, diagnosis = found
+    _, diagnosis = diagnosed
     flights = {w.flight for w in diagnosis.work.after.windows}
     with_events = replace(diagnosis, events=(min(flights), max(flights) + 1))
     little, out = (

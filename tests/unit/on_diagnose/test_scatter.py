@@ -51,12 +51,12 @@ def chosen_of(statistics, days=(), effects=EFFECTS, priors=PRIORS, least=LEAST):
 
 def test_shares_that_change_one_column_keep_their_deviations():
     """Of two that concern the same effect, the later one's prior was taken for both."""
-    found = flights(default_rng(0), release_lag=0.02)
+    statistics = flights(default_rng(0), release_lag=0.02)
     narrow, wide = (
         Candidate(f"lag_{sd}", (0, 1), FLIGHT, deviations=(sd, sd)) for sd in (0.01, 10.0)
     )
-    alone = Linear(found, PRIORS, [narrow], lambda _: 0.0)
-    both = Linear(found, PRIORS, [narrow, wide], lambda _: 0.0)
+    alone = Linear(statistics, PRIORS, [narrow], lambda _: 0.0)
+    both = Linear(statistics, PRIORS, [narrow, wide], lambda _: 0.0)
     theta = np.zeros(len(NAMES))
     (expected,) = alone._promises(FLIGHT, [narrow], theta)
     narrow_promise, wide_promise = both._promises(FLIGHT, [narrow, wide], theta)
@@ -82,10 +82,12 @@ def campaign(rng, days, by_day, by_flight):
     """Flights of some days, three a day, whose release lag is drawn anew each day and each flight
     with these deviations.
     """
-    found, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
+    statistics, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
     offsets = np.repeat(rng.normal(size=days) * by_day / floor, 3)
     return (
-        replace(found, score=found.score + found.information[:, :, 0] * offsets[:, None]),
+        replace(
+            statistics, score=statistics.score + statistics.information[:, :, 0] * offsets[:, None]
+        ),
         np.repeat(np.arange(days), 3).tolist(),
     )
 
@@ -104,7 +106,7 @@ def test_what_is_drawn_anew_each_day_drifts():
 
 
 def test_a_drift_is_reported_with_its_size_and_its_days():
-    found = Scatter(
+    drift = Scatter(
         "lag_jitter",
         "The lag varies",
         "",
@@ -117,7 +119,7 @@ def test_a_drift_is_reported_with_its_size_and_its_days():
         flights=5,
         by=DAY,
     )
-    assert found.sentence == (
+    assert drift.sentence == (
         "drifts, a value for each day. The lag varies: lag_jitter = 0.01 s (95 %: 0.005 to 0.02),"
         " 7 nats from 5 days."
     )
@@ -206,11 +208,11 @@ def delay_jitter(diagnosis):
 
 
 def test_what_single_flights_differ_by_is_integrated_out():
-    found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
+    statistics, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
     left, information, score = (
-        freed(found, share(j, FLIGHT, size)),
-        found.information[0],
-        found.score[0],
+        freed(statistics, share(j, FLIGHT, size)),
+        statistics.information[0],
+        statistics.score[0],
     )
     theta = default_rng(4).normal(size=K)
 
@@ -224,7 +226,9 @@ def test_what_single_flights_differ_by_is_integrated_out():
         / np.sqrt(2.0 * np.pi)
         / size
     )
-    whole = found.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
+    whole = (
+        statistics.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
+    )
     integrated = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
     assert_allclose(integrated, whole, rtol=1e-9)
 
@@ -236,10 +240,10 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
     diagnosis = explain_without_laws(drawn(sizes, seed=seed))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("cmd_delay",)
-    found, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
-    assert found.low < 14.0 * FLOOR < found.high
+    finding, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
+    assert finding.low < 14.0 * FLOOR < finding.high
     assert (
-        found.sd > deviation * FLOOR / np.sqrt(16) * 0.8
+        finding.sd > deviation * FLOOR / np.sqrt(16) * 0.8
     )  # no mean is known better than its flights scatter
     assert varies.found
     assert varies.low < deviation * FLOOR < varies.high
@@ -277,7 +281,7 @@ def world(seed: int):
     information[:, 0, 0] = INFORMATION
     score = np.zeros((count, K))
     score[:, 0] = INFORMATION * measured
-    found = Statistics(
+    statistics = Statistics(
         np.arange(count),
         information,
         score,
@@ -289,25 +293,25 @@ def world(seed: int):
     def again(theta):
         left = measured - answer(theta[0])
         simulated = replace(
-            found,
+            statistics,
             square=INFORMATION * left**2,
             score=INFORMATION * left[:, None] * np.eye(1, K),
             theta=theta,
         )
         return simulated if abs(theta[0]) < 40.0 else None
 
-    return found, again
+    return statistics, again
 
 
 EFFECT = next(v for v in random_effects() if v.name == "lag_jitter")
 
 
-def jitter(found, again):
+def jitter(statistics, again):
     if again is not None:
-        found = relinearised_per_flight(found, np.zeros(len(NAMES)), PRIORS, 0, again)
-    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, found, ())
+        statistics = relinearised_per_flight(statistics, np.zeros(len(NAMES)), PRIORS, 0, again)
+    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, statistics, ())
     share = next(c for c in offered if c.name == "lag_jitter")
-    linear = Linear(found, PRIORS, offered, lambda _: 0.0)
+    linear = Linear(statistics, PRIORS, offered, lambda _: 0.0)
     return verdicts.share_verdict(linear, share, frozenset(offered[:1]), {}, EFFECT, LEAST)
 
 
@@ -327,5 +331,5 @@ def test_flights_far_apart_are_judged_by_simulations_where_they_lie():
 
 
 def test_a_simulation_that_fails_everywhere_leaves_the_derivatives():
-    found, _ = world(0)
-    assert jitter(found, lambda theta: None) == jitter(found, None)
+    statistics, _ = world(0)
+    assert jitter(statistics, lambda theta: None) == jitter(statistics, None)

@@ -44,13 +44,13 @@ def test_one_effect_is_named_with_its_size_and_interval(sign):
     model = SyntheticModel(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
     diagnosis = explain_without_laws(model)
     assert diagnosis.overall == result.KNOWN
-    found = diagnosis["effect_03"]
-    assert found.verdict == result.FOUND
-    assert found.low < 10.0 * sign * found.floor < found.high
+    finding = diagnosis["effect_03"]
+    assert finding.verdict == result.FOUND
+    assert finding.low < 10.0 * sign * finding.floor < finding.high
     assert abs(sizes(model, diagnosis)["effect_03"] - 10.0 * sign) < 1.0  # a floor
     assert diagnosis.named == ("effect_03",)
-    assert "cause 3" in found.sentence
-    assert found.nats > diagnosis.threshold
+    assert "cause 3" in finding.sentence
+    assert finding.nats > diagnosis.threshold
 
 
 TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
@@ -280,11 +280,11 @@ def test_an_interval_that_shrinks_onto_a_bound_is_reported_in_words():
     model.effects = tuple(
         replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS
     )
-    found = explain_without_laws(model)["effect_03"]
-    assert found.verdict == result.BOUNDED
-    assert (found.low, found.high) == (0.0, 0.0)
+    finding = explain_without_laws(model)["effect_03"]
+    assert finding.verdict == result.BOUNDED
+    assert (finding.low, finding.high) == (0.0, 0.0)
     assert (
-        found.sentence
+        finding.sentence
         == "effect_03: on its bound of 0; these flights ask for less than is possible."
     )
 

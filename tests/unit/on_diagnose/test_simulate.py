@@ -93,9 +93,9 @@ def test_the_force_follows_the_thrust_past_a_release(tmp_path, speed):
     command = log["command"]
     late = replace(command, values=np.roll(command.values, 40, axis=0))
     of_another_time = FlightLog({**log.channels, "command": late}, log.meta)
-    found, refused = (list(thrust_checks.look(each)) for each in (log, of_another_time))
-    assert [row.verdict for row in found] == ["ok"], found[0].text
-    assert "the force follows the thrust" in found[0].text
+    rows, refused = (list(thrust_checks.look(each)) for each in (log, of_another_time))
+    assert [row.verdict for row in rows] == ["ok"], rows[0].text
+    assert "the force follows the thrust" in rows[0].text
     assert [row.verdict for row in refused] == ["bad"]
 
 
@@ -106,8 +106,8 @@ def test_a_thrown_payload_says_how_long_its_cable_was(tmp_path, length):
     assert run_command(thrown, "throw at 2 m/s") == 0
     log = FlightLog.load(tmp_path / "throw_at_2_m_s-0.npz")
     rows = physics.look(log, KnownVehicle(cable_length=0.363))
-    (found,) = [row for row in rows if row.topic == "cable"]
-    assert (found.verdict == "bad") == (length == 0.73), found.text
+    (cable,) = [row for row in rows if row.topic == "cable"]
+    assert (cable.verdict == "bad") == (length == 0.73), cable.text
 
 
 def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):

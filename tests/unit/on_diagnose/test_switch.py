@@ -15,9 +15,9 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
     problem = Problem(model, tuple(range(len(model.windows({})))))
     for at in (0.0, 7.0):
         point = linearise(problem, np.where(np.arange(6) == 3, at, 0.0))
-        found = fitted(point, [1, 3])
-        assert found.theta[3] == at
-        assert abs(found.theta[1]) > 2.0
+        refitted = fitted(point, [1, 3])
+        assert refitted.theta[3] == at
+        assert abs(refitted.theta[1]) > 2.0
 
 
 class Promising(SyntheticModel):

@@ -82,11 +82,11 @@ def planted():
 def test_planted_effects_are_recovered(planted):
     _, model = planted
     names = [e.name for e in model.effects]
-    found = np.zeros(len(names))
+    solution = np.zeros(len(names))
     for _ in range(3):  # Gauss and Newton
-        change, deviation = estimate(model.windows(dict(zip(names, found))), range(len(names)))
-        found = found + change
-    for name, size, sd in zip(names, found, deviation):
+        change, deviation = estimate(model.windows(dict(zip(names, solution))), range(len(names)))
+        solution = solution + change
+    for name, size, sd in zip(names, solution, deviation):
         assert abs(size - PLANTED[name]) < 0.02 * abs(PLANTED[name]) + 4.0 * sd, (name, size, sd)
 
 
@@ -280,8 +280,8 @@ def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
     sizes, deviation = sizes + estimate(near, range(len(names)))[0], deviation  # Gauss and Newton
     order = [e.name for e in model.effects]
     for name, size in HIDDEN.items():
-        found, sd = sizes[order.index(name)], deviation[order.index(name)]
-        assert abs(found - size) < 0.1 * size + 4.0 * sd, (name, found, sd)
+        estimated, sd = sizes[order.index(name)], deviation[order.index(name)]
+        assert abs(estimated - size) < 0.1 * size + 4.0 * sd, (name, estimated, sd)
         assert sd < 0.4 * size, name
     projected = [FlightLog(log.channels, {"config": {"keypoints": "projection"}}) for log in logs]
     blind = model_of(projected, "plane_height", "camera_latency", camera=camera)
@@ -343,8 +343,8 @@ def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
     model = model_of(logs, *names, "battery_charge")
     diagnosis = explain_without_laws(model)
     assert set(diagnosis.theta) == {"battery_charge"}
-    found = diagnosis["battery_charge"]
-    assert found.low < (16.8 - 16.18) / 15.2 < found.high  # open voltage: full, a fifth used
+    finding = diagnosis["battery_charge"]
+    assert finding.low < (16.8 - 16.18) / 15.2 < finding.high  # open voltage: full, a fifth used
     assert f"{len(logs)} of {len(logs)} logs hold no battery_voltage" in model.notes[0]
     assert "battery_charge stands for" in model.notes[0]
 
@@ -415,7 +415,7 @@ def throw_logs():
 
 def test_gusts_do_not_take_the_place_of_states(throw_logs):
     calm, shaken = (
-        begun(model_of(found, "rope_length")) for found in (throw_logs, map(swayed, throw_logs))
+        begun(model_of(logs, "rope_length")) for logs in (throw_logs, map(swayed, throw_logs))
     )
     away = shaken["rate_b"] - calm["rate_b"]
     assert np.sqrt(np.mean(away**2)) < RATE_KEPT
@@ -454,11 +454,15 @@ def test_lost_commands_are_found_beside_a_cause():
     setting = setting_with({"com_x": 0.003})
     logs = fly(setting, seed=4, free=1, throws=2, seconds=3.0, lost=SHARE)
     diagnosis = explain(model_of(logs, *ONLY))
-    (found,) = [share for share in diagnosis.scatter if share.found]
-    assert (diagnosis.overall, diagnosis.named, found.name) == ("KNOWN", ("com_x",), dropped.NAME)
+    (share_lost,) = [share for share in diagnosis.scatter if share.found]
+    assert (diagnosis.overall, diagnosis.named, share_lost.name) == (
+        "KNOWN",
+        ("com_x",),
+        dropped.NAME,
+    )
     assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
-    assert found.low < SHARE < found.high
-    assert found.nats > 50.0
+    assert share_lost.low < SHARE < share_lost.high
+    assert share_lost.nats > 50.0
 
 
 def test_lost_commands_are_found_where_one_window_of_all_shows_them():
@@ -467,10 +471,10 @@ def test_lost_commands_are_found_where_one_window_of_all_shows_them():
     """
     logs = fly(setting_with({}), seed=7, free=1, throws=2, seconds=3.0, lost=0.06)
     model = model_of(logs, *ONLY)
-    found = dropped.verdict(linearised(model), (), 5.0)
-    assert found is not None
-    assert found.found
-    assert found.nats > 50.0
+    share_lost = dropped.verdict(linearised(model), (), 5.0)
+    assert share_lost is not None
+    assert share_lost.found
+    assert share_lost.nats > 50.0
 
 
 def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():

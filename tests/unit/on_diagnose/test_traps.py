@@ -53,10 +53,10 @@ def test_flights_as_they_are(number):
 
 @mark.parametrize("number", [204, 205])
 def test_exchanged_axes_are_named_with_their_evidence(number):
-    found = bad(changed(recorded(number), PATHS, lambda v: v[:, [1, 0, 2]]))
-    assert "fit with (y,x,z) of positions and velocities" in found
-    assert float(found.split(" nats better")[0].split()[-1]) > 15.0
-    assert "a mirror image" in found
+    text = bad(changed(recorded(number), PATHS, lambda v: v[:, [1, 0, 2]]))
+    assert "fit with (y,x,z) of positions and velocities" in text
+    assert float(text.split(" nats better")[0].split()[-1]) > 15.0
+    assert "a mirror image" in text
 
 
 def test_an_exchanged_accelerometer_is_named():
@@ -75,15 +75,15 @@ def test_an_exchanged_accelerometer_is_named():
 )
 def test_late_streams_are_named_with_their_offset(streams, row):
     (checked,) = check([shifted(recorded(204), *streams)], CRAZYFLIE)
-    (found,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
-    assert found.figures["delay_s"] == approx(LATE, abs=0.02)
+    (delay,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
+    assert delay.figures["delay_s"] == approx(LATE, abs=0.02)
     assert contradictions([checked])
 
 
 def test_thrust_of_another_flight_is_refused():
-    found = bad(with_channels(recorded(205), thrust_command=recorded(204)["thrust_command"]))
-    assert "the force does not follow the thrust" in found
-    assert "thrust of another flight" in found
+    text = bad(with_channels(recorded(205), thrust_command=recorded(204)["thrust_command"]))
+    assert "the force does not follow the thrust" in text
+    assert "thrust of another flight" in text
 
 
 def test_early_thrust_is_named():
@@ -106,8 +106,8 @@ def test_early_thrust_is_named():
     ],
 )
 def test_units_are_named_by_their_ratio(names, factor, words):
-    found = bad(changed(recorded(204), names, lambda v: v * factor))
-    assert all(part in found for part in words.split(".*")), found
+    text = bad(changed(recorded(204), names, lambda v: v * factor))
+    assert all(part in text for part in words.split(".*")), text
 
 
 @mark.parametrize(
@@ -115,9 +115,9 @@ def test_units_are_named_by_their_ratio(names, factor, words):
     [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")],
 )
 def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
-    found = bad(recorded(204), replace(CRAZYFLIE, mass=mass))
-    assert words in found
-    assert bool(found) == bool(words)
+    text = bad(recorded(204), replace(CRAZYFLIE, mass=mass))
+    assert words in text
+    assert bool(text) == bool(words)
 
 
 def test_the_cable_is_held_against_the_models():

@@ -105,15 +105,15 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
     knots = random_knots()
     terms = laws.terms_of(laws.JOINT, KNOTS)[:5]
     torque_b = table(terms, knots)
-    found = laws.loads(laws.JOINT, laws.KnotValues(knots), torque_b)
-    assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
-    assert_allclose(found["vehicle force"], -found["payload force"])
+    loads = laws.loads(laws.JOINT, laws.KnotValues(knots), torque_b)
+    assert tuple(sorted(loads)) == tuple(sorted(LATENT_BLOCKS))
+    assert_allclose(loads["vehicle force"], -loads["payload force"])
     away = knots["payload_pos_w"] - knots["pos_w"]
     along = away - rotate(knots["quat_wb"], knots["mount_b"])
     along /= norm(along, axis=1, keepdims=True)
     for i in range(len(terms)):
-        on_vehicle = rotate(knots["quat_wb"], found["vehicle torque"][:, :, i])
-        about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
+        on_vehicle = rotate(knots["quat_wb"], loads["vehicle torque"][:, :, i])
+        about_it = on_vehicle + np.cross(away, loads["payload force"][:, :, i])
         twist = (
             np.einsum("ki,ki->k", rotate(knots["quat_wb"], torque_b[:, :, i]), along)[:, None]
             * along
@@ -283,10 +283,10 @@ def beside_a_law(model: SyntheticModel, active: list[int], *active_terms: laws.T
             [point], [terms.as_effect(term, 0.1, 7.0) for term in active_terms]
         )
     columns = [*active, *range(len(model.effects), len(point.theta))]
-    found = Selector(point, 4.0)
-    chosen = frozenset(c for c in found.candidates if c.group == ALL and c.columns[0] in columns)
-    found.best = Trial(chosen, candidate(point, columns))
-    return found
+    selector = Selector(point, 4.0)
+    chosen = frozenset(c for c in selector.candidates if c.group == ALL and c.columns[0] in columns)
+    selector.best = Trial(chosen, candidate(point, columns))
+    return selector
 
 
 @mark.parametrize("block", ["vehicle force", "payload force"])

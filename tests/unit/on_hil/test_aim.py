@@ -39,8 +39,10 @@ def fallen(pos, vel, drag):
 @mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
 def test_prediction_against_an_integrator(vel, drag):
     pos = (0.4, -0.1, 1.2)
-    found = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(at(pos, vel))
-    assert found == approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
+    landing = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(
+        at(pos, vel)
+    )
+    assert landing == approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
 
 
 def test_a_payload_below_the_ground_or_without_end_is_judged():

@@ -54,29 +54,32 @@ def audit(values, write=False):
 
 def test_a_parameter_that_does_not_come_is_a_mismatch():
     values = {k: v for k, v in GOOD.items() if k != "ATC_ANGLE_BOOST"}
-    found, requests, _, tables, now = audit(values)
-    assert found.problems == ["ATC_ANGLE_BOOST did not come; expected 0"]
+    checked, requests, _, tables, now = audit(values)
+    assert checked.problems == ["ATC_ANGLE_BOOST did not come; expected 0"]
     assert GIVE_UP < now < GIVE_UP + 0.1
     assert 20 <= requests.count("ATC_ANGLE_BOOST") <= 27, "requested repeatedly"
     assert "no answer" in tables[0]
 
 
 def test_writing_keeps_other_bits_and_is_read_back():
-    found, _, written, tables, _ = audit(
+    checked, _, written, tables, _ = audit(
         {**GOOD, "GUID_OPTIONS": 5.0, "GUID_TIMEOUT": 3.0}, write=True
     )
-    assert (found.problems, sorted(written)) == ([], [("GUID_OPTIONS", 13), ("GUID_TIMEOUT", 0.5)])
+    assert (checked.problems, sorted(written)) == (
+        [],
+        [("GUID_OPTIONS", 13), ("GUID_TIMEOUT", 0.5)],
+    )
     assert tables[0].count("(written)") == 2
 
 
 def test_what_cannot_be_written_stays_wrong():
-    found, _, written, _, _ = audit({**GOOD, "FIXED": float("nan")}, write=True)
-    assert (found.problems, written) == (["FIXED is nan; expected 7"], [])
+    checked, _, written, _, _ = audit({**GOOD, "FIXED": float("nan")}, write=True)
+    assert (checked.problems, written) == (["FIXED is nan; expected 7"], [])
 
 
 def test_a_timeout_of_zero_is_below_its_range():
-    found, *_ = audit({**GOOD, "GUID_TIMEOUT": 0.0})
-    assert found.problems == ["GUID_TIMEOUT is 0; expected above 0, at most 0.5"]
+    checked, *_ = audit({**GOOD, "GUID_TIMEOUT": 0.0})
+    assert checked.problems == ["GUID_TIMEOUT is 0; expected above 0, at most 0.5"]
 
 
 def test_a_value_that_the_vehicle_does_not_take_is_written_once():

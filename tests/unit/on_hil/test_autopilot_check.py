@@ -46,8 +46,8 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
             if tick["command"]:
                 tick["command"][0] *= factor
 
-    found, text = hover_of_run(copy_run(run, tmp_path, strengthen))
-    assert found == good
+    passed, text = hover_of_run(copy_run(run, tmp_path, strengthen))
+    assert passed == good
     assert run_command(f"hil check --hover-of {tmp_path}") == (0 if good else 1)
     ratio = float(text.split()[2])
     assert ratio == approx(factor, rel=0.01)

@@ -160,16 +160,16 @@ def hall():
 
 
 def test_tilt_latency_and_thrust_are_found_in_the_runners_hover(hall):
-    found = hall.runner.calibrating.calibration
-    assert found is not None, hall.runner.calibrating.problems()
-    np.testing.assert_allclose(np.degrees(found.turn_b), TILT_DEG, atol=0.15)
-    assert found.latency == approx(LATENCY, abs=0.004)
-    assert found.thrust == approx(1.0, abs=0.02)
-    assert found.scale == approx(SCALE, abs=0.004)
+    calibration = hall.runner.calibrating.calibration
+    assert calibration is not None, hall.runner.calibrating.problems()
+    np.testing.assert_allclose(np.degrees(calibration.turn_b), TILT_DEG, atol=0.15)
+    assert calibration.latency == approx(LATENCY, abs=0.004)
+    assert calibration.thrust == approx(1.0, abs=0.02)
+    assert calibration.scale == approx(SCALE, abs=0.004)
     decision = next(d for d in hall.decisions if d.calibration is not None)
-    assert Calibration.of(decision.calibration) == found
-    assert hall.runner.summary()["calibration"] == found.values()
-    assert "deg" in str(found)
+    assert Calibration.of(decision.calibration) == calibration
+    assert hall.runner.summary()["calibration"] == calibration.values()
+    assert "deg" in str(calibration)
     sways = [abs(d.command[1]) for d in hall.decisions if d.command is not None]
     assert max(sways) > 0.8, "the runner swayed"
     assert np.mean(sways[-50:]) < 0.2, "and came to rest, but for the noise of the poses"

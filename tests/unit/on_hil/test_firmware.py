@@ -44,11 +44,11 @@ def test_a_program_that_ends_at_once_is_reported(tmp_path, monkeypatch):
 
 
 def test_settings_follow_the_runs_configuration(params):
-    found = needed(params)
-    assert found["roll_srate"] == "60"
-    assert found["yaw_srate"] == "30"
-    assert found["aux 0"] == "0 0 1700 2100 0 0"
-    assert "aux 1" not in found
+    settings = needed(params)
+    assert settings["roll_srate"] == "60"
+    assert settings["yaw_srate"] == "30"
+    assert settings["aux 0"] == "0 0 1700 2100 0 0"
+    assert "aux 1" not in settings
     override = load_run("betaflight_sitl", ["betaflight.arm_channel=0"]).betaflight
     assert needed(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
     assert needed(override)["aux 1"].startswith("50 ")

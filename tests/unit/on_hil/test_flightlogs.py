@@ -147,7 +147,7 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
     """A payload pulled with three times its weight until 0.113 s, then free; 1 mm of noise, 100 Hz,
     2 % lost.
     """
-    rng, found = default_rng(0), []
+    rng, errors = default_rng(0), []
     for _ in range(40):
         let_go, start, vel = (
             0.113 + 0.01 * rng.random(),
@@ -162,10 +162,10 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
         points = start + free * vel + [0, 0, -0.5 * 9.81] * free**2 + 0.5 * pull * held**2
         points = points + 1e-3 * rng.standard_normal(points.shape)
         when, where = separation(times, points, 0.11)
-        found.append(when - let_go)
+        errors.append(when - let_go)
         assert norm(np.subtract(where, start)) < 0.03
-    assert abs(np.mean(found)) < CLOCK
-    assert np.std(found) < 2 * CLOCK
+    assert abs(np.mean(errors)) < CLOCK
+    assert np.std(errors) < 2 * CLOCK
 
 
 def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
@@ -173,15 +173,15 @@ def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
     lands.
     """
     fall = math.sqrt(2 * (1.1 - 0.04) / 9.81)
-    for before, found in ((0.06, True), (0.25, False)):
+    for before, detected in ((0.06, True), (0.25, False)):
         flight = PayloadFlight((2.0, 0.0, 0.0), 0.0, 0.0, 0.04, 0.11)
         for t in np.arange(0.0, 0.11 + fall - before, 0.01):
             free = max(t - 0.11, 0.0)
             assert flight.add(t, (4.0 * free, 0.0, 1.1 - 0.5 * 9.81 * free * free)) is None
         assert flight.overdue(0.11 + fall + 0.02) is None, "not yet"
         landing = flight.overdue(0.11 + fall + 0.2)
-        assert (landing is not None) == found
-        if found:
+        assert (landing is not None) == detected
+        if detected:
             assert landing.time == approx(0.11 + fall, abs=1e-6)
             assert_allclose(landing.landing_w, (4.0 * fall, 0.0, 0.04), atol=1e-6)
 

@@ -100,10 +100,10 @@ def test_a_left_handed_world_is_reported(track):
     mirrored = [
         Pose(p.stamp, p.arrival, p.body, (p.pos[0], -p.pos[1], p.pos[2]), p.quat) for p in track
     ]
-    found = judge(find_steps(mirrored), OURS)
-    assert found.mirrored
-    assert not found.passed
-    assert "mirrored world" in summary_text(found, OURS)
+    judged = judge(find_steps(mirrored), OURS)
+    assert judged.mirrored
+    assert not judged.passed
+    assert "mirrored world" in summary_text(judged, OURS)
 
 
 def test_moves_that_were_left_out_are_counted():

@@ -22,9 +22,9 @@ def test_percentiles_of_many_times():
         stage.add(float(t))
     for share in (0.5, 0.95, 0.99):
         assert stage.percentile(share) == approx(np.quantile(times, share), rel=BIN)
-    found = stage.summary()
-    assert found["max_ms"] == approx(1e3 * times.max(), rel=1e-12)
-    assert found["count"] == 20_000
+    summary = stage.summary()
+    assert summary["max_ms"] == approx(1e3 * times.max(), rel=1e-12)
+    assert summary["count"] == 20_000
 
 
 def test_nothing_zero_and_very_long_times():

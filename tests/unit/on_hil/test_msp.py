@@ -26,11 +26,11 @@ def test_a_round_trip_in_any_pieces(payload):
     frame = msp.Frame(105, payload, msp.ANSWER)
     data = b"noise$" + msp.pack(frame) + b"$M>" + msp.pack(frame)
     for size in (1, 2, 3, 7, len(data)):
-        parser, found = msp.FrameParser(), []
+        parser, frames = msp.FrameParser(), []
         for at in range(0, len(data), size):
-            found += parser.parse(data[at : at + size])
-        assert frame in found
-        assert all(f == frame for f in found), "nothing else is made of it"
+            frames += parser.parse(data[at : at + size])
+        assert frame in frames
+        assert all(f == frame for f in frames), "nothing else is made of it"
 
 
 @mark.parametrize(("last", "aux"), [(48, 0.0), (49, 2.0)])

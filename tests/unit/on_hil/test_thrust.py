@@ -43,8 +43,8 @@ def test_the_measured_hover_is_held_against_the_calibration(off, good):
         meter.add(0.37 * (1.0 + off))
         meter.add(None)
         meter.add(float("nan"))
-    found, text = meter.summary_text(2.668 / GRAVITY)
-    assert found == good
+    passed, text = meter.summary_text(2.668 / GRAVITY)
+    assert passed == good
     assert f"measured {0.37 * (1 + off):.3f}, by the config 0.370 ({100.0 * off:+.1f} %" in text
     assert ("calibrate" in text) == (not good)
 

@@ -30,11 +30,11 @@ def ulog(path, *, flags=(1, 1, 1, 1), eph=0.3, resets=0, topics=None, parameters
         place = (swing(i), 0.0, -1.5, 2.0 * math.cos(0.1 * i), 0.0, 0.0)
         local.append((t, *place, eph if late else 0.3, *good, resets if late else 0))
         attitude.append((t, 1.0, 0.01 * swing(i), 0.0, 0.0))
-    found = {
+    standard = {
         ("vehicle_local_position", 0): (LOCAL, local),
         ("vehicle_attitude", 0): (["uint64_t timestamp", "float[4] q"], attitude),
     }
-    logfiles.write_ulg(path, found | (topics or {}), parameters)
+    logfiles.write_ulg(path, standard | (topics or {}), parameters)
     return path
 
 

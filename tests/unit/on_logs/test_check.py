@@ -106,8 +106,8 @@ def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
     known = ({"attached": attached}, {"release_command": pressed}, {})
     checks = [check([kept, log_of(lighter, **more)]) for more in known]
     assert [
-        any("the thrust's scale differs" in row.text for one in found for row in one.rows)
-        for found in checks
+        any("the thrust's scale differs" in row.text for one in checked for row in one.rows)
+        for checked in checks
     ] == [False, False, True]
 
 
@@ -127,9 +127,9 @@ UNITS_OF_OTHERS = [
 def test_wrong_units_and_signs(channel, factor, words):
     columns = flight()
     columns[channel] = columns[channel] * factor
-    found = faults(log_of(columns))
-    assert found
-    assert all(word in found for word in words.split(" ", 1)), found
+    text = faults(log_of(columns))
+    assert text
+    assert all(word in text for word in words.split(" ", 1)), text
 
 
 @mark.parametrize("channel", ["rate_b", "vel_w", "acc_b"])
@@ -139,11 +139,11 @@ def test_wrong_units_and_signs(channel, factor, words):
 def test_wrong_axes(channel, order, signs):
     columns = flight()
     columns[channel] = columns[channel][:, order] * signs
-    found = faults(log_of(columns))
+    text = faults(log_of(columns))
     if channel == "acc_b" and order == (1, 0, 2):
         return  # gravity alone does not distinguish x from y
-    assert "frames" in found, found
-    assert channel in found
+    assert "frames" in text, text
+    assert channel in text
 
 
 @mark.parametrize("unread", [(), ("acc_b",)])
@@ -361,10 +361,10 @@ def test_a_drifting_clock_is_reported():
     columns["est_pos_w"] = np.column_stack(
         [np.interp(stretched, columns["time"], c) for c in columns["pos_w"].T]
     )
-    found = re.search(r"the delay runs from (\S+) to (\S+) ms", faults(log_of(columns), "warn"))
+    match = re.search(r"the delay runs from (\S+) to (\S+) ms", faults(log_of(columns), "warn"))
     # pieces about 32.5 and 2.5 s, of a clock that gains a millisecond a second
-    assert float(found[1]) == approx(-32.5, abs=3.0)
-    assert float(found[2]) == approx(-2.5, abs=1.0)
+    assert float(match[1]) == approx(-32.5, abs=3.0)
+    assert float(match[2]) == approx(-2.5, abs=1.0)
 
 
 def test_deviations_of_delays_hold_what_they_say():
@@ -381,8 +381,8 @@ def test_a_delay_that_noise_hides_is_not_reported(width):
         pos = np.column_stack([width * np.sin(0.3 * time), 0 * time, 0 * time])
         vel = np.column_stack([0.3 * width * np.cos(0.3 * time), 0 * time, 0 * time])
         pos, vel = pos + rng.normal(0, 1e-3, pos.shape), vel + rng.normal(0, 5e-3, vel.shape)
-        found = relate(Samples(time, pos).derivative(), Samples(time, vel))
-        assert abs(found.delay) < 2.0 * found.delay_sd
+        relation = relate(Samples(time, pos).derivative(), Samples(time, vel))
+        assert abs(relation.delay) < 2.0 * relation.delay_sd
 
 
 @mark.parametrize(("count", "clipped", "reported"), [(60, 0, False), (60, 6, True), (40, 0, False)])
@@ -397,8 +397,8 @@ def test_gaps_and_clocks():
     columns = flight()
     keep = np.ones(len(columns["time"]), bool)
     keep[300:420] = False
-    found = faults(log_of({name: values[keep] for name, values in columns.items()}), "warn")
-    assert "the longest 1.21" in found
+    text = faults(log_of({name: values[keep] for name, values in columns.items()}), "warn")
+    assert "the longest 1.21" in text
     columns = flight()
     columns["time"] = columns["time"] + default_rng(0).uniform(-0.004, 0.004, len(columns["time"]))
     assert "clock" in faults(log_of(columns), "warn")
@@ -720,9 +720,9 @@ def test_a_turned_accelerometer_is_named(turned_deg, late, words):
     airborne = log_at(time - late, quat_wb=turn.as_quat(), acc_b=force)
     log = log_at(time, pos_w=np.cumsum(vel, axis=0) * 0.01, vel_w=vel)
     log = with_channels(log, **airborne.channels)
-    found = faults(log) + faults(log, "warn")
-    assert words in found
-    assert ("acc_b fits" in found) == bool(words)
+    text = faults(log) + faults(log, "warn")
+    assert words in text
+    assert ("acc_b fits" in text) == bool(words)
     assert ("acc_b fits" in faults(log)) == (turned_deg == 90.0)
 
 

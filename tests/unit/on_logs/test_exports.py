@@ -133,8 +133,8 @@ def proposed(tmp_path):
         path = tmp_path / name
         path.write_text(text, newline="")
         table = table_of(path)
-        found = propose(table, name)
-        return table, found, logs_of(table, found.mapping, name)
+        proposal = propose(table, name)
+        return table, proposal, logs_of(table, proposal.mapping, name)
 
     return take
 
@@ -142,8 +142,8 @@ def proposed(tmp_path):
 def test_poses_of_kitti_are_matrices(proposed):
     """Twelve numbers a row without a head or a stamp: the upper rows of a pose, row by row."""
     poses = np.concatenate([TURN.as_matrix(), POS[:, :, None]], axis=2).reshape(-1, 12)
-    _, found, (log,) = proposed(lines(poses.round(9).tolist(), " "), "00.txt")
-    assert asks(found, "how far are the rows apart")
+    _, proposal, (log,) = proposed(lines(poses.round(9).tolist(), " "), "00.txt")
+    assert asks(proposal, "how far are the rows apart")
     assert_allclose(log["pos_w"].values, POS, atol=1e-6)
     turned = (Rotation.from_quat(log["quat_wb"].values) * TURN.inv()).magnitude()
     assert np.max(turned) < 1e-6
@@ -151,7 +151,7 @@ def test_poses_of_kitti_are_matrices(proposed):
 
 @pytest.mark.parametrize("name", EXPORTS)
 def test_an_export_gives_the_motion_that_it_was_made_of(name, proposed):
-    _, found, (log, *_) = proposed(EXPORTS[name], name)
+    _, proposal, (log, *_) = proposed(EXPORTS[name], name)
     time = log["pos_w"].time - log["pos_w"].time[0]
     pos, turn = motion(time)
     good = log["pos_w"].valid
@@ -161,15 +161,15 @@ def test_an_export_gives_the_motion_that_it_was_made_of(name, proposed):
     _, turn = motion(attitude.time - attitude.time[0])
     ours = Rotation.from_quat(attitude.values[attitude.valid])
     assert np.max((turn[attitude.valid].inv() * ours).magnitude()) < 2e-3
-    assert not asks(found, "which axis is up")
+    assert not asks(proposal, "which axis is up")
 
 
 @pytest.mark.parametrize("name", ["motive 3.csv", "vicon nexus.csv", "qualisys.tsv"])
 def test_every_column_that_is_left_out_is_listed(name, proposed):
-    table, found, _ = proposed(EXPORTS[name], name)
-    used = {column for entry in found.mapping.channels for column in entry.columns}
-    assert used | {found.mapping.time.column} | set(found.left_out) == set(table)
-    assert any("Frame" in column for column in found.left_out)
+    table, proposal, _ = proposed(EXPORTS[name], name)
+    used = {column for entry in proposal.mapping.channels for column in entry.columns}
+    assert used | {proposal.mapping.time.column} | set(proposal.left_out) == set(table)
+    assert any("Frame" in column for column in proposal.left_out)
 
 
 def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
@@ -208,12 +208,12 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, proposed):
     pos[200:260] = pos[199] if mode == "held" else 0.0
     quat[200:260] = {"all zero": [0, 0, 0, 0], "position zero": [0, 0, 0, 1]}.get(mode, quat[199])
     text = table_with("x,y,z,qx,qy,qz,qw,px,py,pz", pos, quat, POS - [0.0, 0.0, 0.5])
-    _, found, (log, *_) = proposed(text)
+    _, proposal, (log, *_) = proposed(text)
     assert "pos_w" in log
     if mode != "held":
         assert "payload_pos_w" in log
         assert np.array_equal(np.flatnonzero(~log["pos_w"].valid), np.arange(200, 260))
-    assert not asks(found, "mirror")
+    assert not asks(proposal, "mirror")
 
 
 @pytest.mark.parametrize("extra", ["", "EVENT\tThrow\t120\t1.2\n", "TRAJECTORY_TYPES\tA\tB\n"])
@@ -241,10 +241,10 @@ def test_angles_in_degrees_are_no_position(proposed):
     """Euler angles whose order no name gives are left out and listed."""
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
-    _, found, _ = proposed(table_with(",".join(names), angles, POS))
-    (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
+    _, proposal, _ = proposed(table_with(",".join(names), angles, POS))
+    (entry,) = (entry for entry in proposal.mapping.channels if entry.name == "pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
-    assert "quad.Rotation.X [deg]" in found.left_out
+    assert "quad.Rotation.X [deg]" in proposal.left_out
 
 
 QUESTIONS = {
@@ -260,8 +260,8 @@ def test_what_nothing_checks_becomes_a_question(head, proposed):
     rng = np.random.default_rng(0)
     rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
     acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
-    _, found, _ = proposed(table_with(head, rates, acc))
-    assert asks(found, QUESTIONS[head])
+    _, proposal, _ = proposed(table_with(head, rates, acc))
+    assert asks(proposal, QUESTIONS[head])
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
@@ -271,8 +271,8 @@ def test_velocities_of_the_world_and_of_the_body_are_distinguished(frame, propos
     vel = np.gradient(POS, TIME, axis=0)
     vel = vel if frame == "world" else turn.inv().apply(vel)
     text = table_with("x,y,z,qx,qy,qz,qw,vx,vy,vz", POS, turn.as_quat(), vel)
-    _, found, _ = proposed(text)
-    names = {entry.name for entry in found.mapping.channels}
+    _, proposal, _ = proposed(text)
+    names = {entry.name for entry in proposal.mapping.channels}
     assert ("vel_b" in names, "vel_w" in names) == (frame == "body", frame == "world")
 
 
@@ -280,6 +280,6 @@ def test_rotor_speeds_are_proposed_as_speeds(proposed):
     speeds = 6000.0 + 100.0 * np.sin(np.outer(TIME, [1.0, 1.1, 1.2, 1.3]))
     heads = {"rpm1,rpm2,rpm3,rpm4": "rpm", "m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]": "rad/s"}
     for head, unit in heads.items():
-        _, found, _ = proposed(table_with(f"x,y,z,{head}", POS, speeds))
-        (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
+        _, proposal, _ = proposed(table_with(f"x,y,z,{head}", POS, speeds))
+        (entry,) = [e for e in proposal.mapping.channels if e.name == "motor_speed"]
         assert entry.unit == unit

@@ -146,8 +146,8 @@ class TestBlackbox:
         assert np.linalg.norm(log["acc_b"].values.mean(0)) == approx(9.81, rel=0.02)
         assert log["battery_voltage"].values.mean() == approx(24.6, abs=0.1)
         assert log["motor_command"].values.shape == (98, 4)
-        found = blackbox.read_blackbox(BBL)[0]
-        raw = dict(zip(found.names, found.main.T))
+        decoded = blackbox.read_blackbox(BBL)[0]
+        raw = dict(zip(decoded.names, decoded.main.T))
         front_left = (raw["motor[3]"] - 158) / (2047 - 158)
         assert log["motor_command"].values[:, 0] == approx(front_left)
         assert log["rate_b"].values[:, 2] == approx(np.radians(raw["gyroADC[2]"]))

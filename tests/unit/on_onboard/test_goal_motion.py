@@ -82,7 +82,7 @@ def test_a_located_state_layout_has_the_mean_goal():
     frames = torch.zeros(10, 1, layout.frame)
     frames[:, 0, :2] = torch.tensor(places)
     frames[:, 0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(goals - places)
-    for step, found in enumerate(followed(layout, frames, None, None)):
-        assert torch.equal(found.frame, frames[step])
+    for step, estimate in enumerate(followed(layout, frames, None, None)):
+        assert torch.equal(estimate.frame, frames[step])
         expected = np.mean(goals[: step + 1], axis=0) - places[step]
-        assert_allclose(found.places[0].numpy(), expected, atol=1e-5)
+        assert_allclose(estimate.places[0].numpy(), expected, atol=1e-5)

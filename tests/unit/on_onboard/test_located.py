@@ -63,14 +63,14 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     off = []
     frames = [frame + 0.01 * torch.randn_like(frame) for _ in range(40)]
     for noisy, estimate in zip(frames, followed(layout, frames, valid, camera)):
-        found = estimate.places
-        off.append((found[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
+        located = estimate.places
+        off.append((located[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
     fresh = torch.zeros(8, dtype=torch.bool)
     assert torch.stack(off[-5:]).mean() < 0.4 * torch.stack(off[:1]).mean()
     _, _, blind, shown, counts = update_goal_fit(
         layout, frame, torch.zeros_like(valid), camera, estimate.sums, torch.full((8,), 0.8), fresh
     )
-    assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
+    assert_close(blind[:, :2] + frame[:, :2], located[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
     assert (blind[:, 5] == 1.0).all()
     assert counts[:, :4].all(), "corners read where the goal would appear"
     assert not counts[:, 4:].any(), "the payload does not"
@@ -85,31 +85,31 @@ def test_a_goal_that_moves_is_where_it_is_now():
         60, 1, 1
     )  # the vehicle moves with the goal: its observations do not change
     frames[:, :, :2] += 0.02 * torch.arange(60.0)[:, None, None] * speed
-    *_, (_, velocity, found, _, _) = followed(layout, frames, valid, camera)
+    *_, (_, velocity, located, _, _) = followed(layout, frames, valid, camera)
     assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
-    assert_close(found[:, :2], offset, rtol=0, atol=0.02)
+    assert_close(located[:, :2], offset, rtol=0, atol=0.02)
 
 
 def test_without_noise_it_is_the_truth():
     layout, camera, frame, valid, offset, ray = scene()
     assert valid.all()
-    found = places(layout, frame, valid, camera)
-    assert_close(found[:, :2], offset, rtol=0, atol=2e-4)
+    located = places(layout, frame, valid, camera)
+    assert_close(located[:, :2], offset, rtol=0, atol=2e-4)
     measured, _ = goal_motion.measure_goal(layout, frame, valid, camera)
     assert_close(measured, offset + frame[:, :2], rtol=0, atol=2e-4)
-    assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
-    assert (found[:, 5] == 1.0).all()
+    assert_close(located[:, 2:5], ray, rtol=0, atol=EXACT)
+    assert (located[:, 5] == 1.0).all()
 
 
 def test_one_wrong_point_of_each_is_outvoted():
     layout, camera, frame, valid, offset, ray = scene()
     for wrong in (15, 16, 25, 26):  # of the first corner, of the box's second side
         frame[:, wrong] = 0.4
-    found = places(layout, frame, valid, camera)
+    located = places(layout, frame, valid, camera)
     assert (
-        found[:, :2] - offset
+        located[:, :2] - offset
     ).abs().max() < 0.05  # the square's corners disagree by the middle's neighbours
-    assert (found[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
+    assert (located[:, 2:5] - ray).norm(dim=-1).max() < 0.1  # half of the ball's angle
 
 
 def test_what_is_not_visible_is_zero():
@@ -117,10 +117,10 @@ def test_what_is_not_visible_is_zero():
     valid = valid.clone()
     valid[:4, :4] = False
     valid[4:, 4:] = False
-    found = places(layout, frame, valid, camera)
-    assert found[:4, [0, 1, 5]].abs().max() == 0.0
+    located = places(layout, frame, valid, camera)
+    assert located[:4, [0, 1, 5]].abs().max() == 0.0
     _, weight = goal_motion.measure_goal(layout, frame, valid, camera)
     assert (weight > 0.0).tolist() == [False] * 4 + [True] * 4
-    assert found[4:, 2:5].abs().max() == 0.0
-    assert (found[4:, 5] == 1.0).all()
-    assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
+    assert located[4:, 2:5].abs().max() == 0.0
+    assert (located[4:, 5] == 1.0).all()
+    assert_close(located[:4, 2:5], ray[:4], rtol=0, atol=EXACT)

@@ -74,8 +74,8 @@ def test_a_response_with_gaps_is_that_of_regular_steps(times):
 
 def test_what_is_older_than_the_throw_is_its_first_step():
     history = torch.tensor([[[4.0], [1.0], [1.0], [1.0]]])
-    found = resample(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
-    assert found[0, :, 0].tolist() == approx([6.0, 4.0, 1.0, 1.0])
+    resampled = resample(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
+    assert resampled[0, :, 0].tolist() == approx([6.0, 4.0, 1.0, 1.0])
 
 
 def test_a_release_that_was_not_done_is_not_reported():

@@ -42,8 +42,8 @@ def texts(section, kind: str) -> str:
     )
 
 
-def only(*found) -> result_set.ResultSet:
-    return result_set.ResultSet(tuple(found))
+def only(*entries) -> result_set.ResultSet:
+    return result_set.ResultSet(tuple(entries))
 
 
 def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
@@ -60,9 +60,9 @@ def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
     results.pack([*parts, old], tmp_path / "throws" / "x.json")
     (tmp_path / "findings").mkdir()
     (tmp_path / "findings" / "front.md").write_text("Why.\n")
-    found = result_set.read([tmp_path])
-    assert [len(r.good) for r in found.results] == [8]
-    assert found.findings == {"front": "Why."}
+    book = result_set.read([tmp_path])
+    assert [len(r.good) for r in book.results] == [8]
+    assert book.findings == {"front": "Why."}
 
 
 def test_an_empty_book_says_everything_that_is_missing(tmp_path):
@@ -118,13 +118,13 @@ def test_ablation_ratio_bias_and_the_verdict():
         ]
 
     cable = trained("rigid_cable", 0.02, (0.1, 0.0))
-    found = only(
+    book = only(
         *trained("full", 0.02),
         *trained("no_motor_lag", 0.04),
         *cable,
         *trained("no_aerodynamics", 0.02),
     )
-    section = ablations.section(found)
+    section = ablations.section(book)
     rows = {row[0]: row for row in grids(section)[0].rows}
     assert float(rows["no motor lag"][5].split(" [")[0]) == approx(2.0, abs=0.15)
     assert rows["no motor lag"][6].startswith("2.4 [")

@@ -51,9 +51,9 @@ allow = ["rope"]
 
 @fixture
 def path(tmp_path):
-    found = tmp_path / "list.toml"
-    found.write_text(LIST)
-    return str(found)
+    list_file = tmp_path / "list.toml"
+    list_file.write_text(LIST)
+    return str(list_file)
 
 
 def finish(source, out):
@@ -312,8 +312,8 @@ def test_records_join_what_two_machines_did(path, tmp_path):
         3.0,
         0.02,
     )
-    found = results.load(throws)
-    assert len(found) == 4 * 4
+    throws_before = results.load(throws)
+    assert len(throws_before) == 4 * 4
     before = throws.read_text()
     collect(work, second, records)
     assert throws.read_text() == before
@@ -327,7 +327,7 @@ def test_records_join_what_two_machines_did(path, tmp_path):
     collect(work, second, records)
     again = results.load(throws)
     assert len(again) == 16
-    assert {r.unit["weights"] for r in again} != {r.unit["weights"] for r in found}
+    assert {r.unit["weights"] for r in again} != {r.unit["weights"] for r in throws_before}
 
 
 def test_status_and_mistakes_on_the_command_line(path, tmp_path, refused, printed):

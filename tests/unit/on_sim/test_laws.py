@@ -86,10 +86,10 @@ def test_factors_are_the_grammars():
     assert set(vectors) == set(BLOCKS) == set(grammar.VECTORS)
     for block, of in grammar.VECTORS.items():
         assert set(vectors[block]) == set(of), block
-        for name, found in vectors[block].items():
+        for name, value in vectors[block].items():
             factor = of[name]
             np.testing.assert_allclose(
-                found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}"
+                value, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}"
             )
 
 

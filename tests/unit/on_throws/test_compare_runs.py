@@ -54,11 +54,11 @@ def test_a_row_a_policy_and_target():
     assert (first.name, second.name) == ("state", "vision")
     at_15, at_2 = second.throws
     assert (at_15.target, at_2.target) == (1.5, 2.0)
-    found = at_2.summary()
-    assert (found["throws"], found["success"]) == (4, 0.75)
-    assert found["error_mean"] == approx(0.5 / 3)
-    assert found["bias_x"] == approx(0.1)
-    assert found["smoothness"] == approx(0.1)
+    summary = at_2.summary()
+    assert (summary["throws"], summary["success"]) == (4, 0.75)
+    assert summary["error_mean"] == approx(0.5 / 3)
+    assert summary["bias_x"] == approx(0.1)
+    assert summary["smoothness"] == approx(0.1)
     assert at_15.summary()["bias_y"] == approx(0.2)
     assert first.throws[0].summary()["throws"] == 0, "the state policy did not throw at 1.5 m"
 

@@ -79,8 +79,8 @@ def test_work_does_only_what_is_missing(tmp_path):
 
     results.work([unit(0)], tmp_path, function)
     known = {results.key_of(unit(1)): results.Result(unit(1), columns(1))}
-    found = results.work([unit(0), unit(1), unit(2), unit(2)], tmp_path, function, known)
+    units = results.work([unit(0), unit(1), unit(2), unit(2)], tmp_path, function, known)
     assert calls == [0, 2]
-    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == approx(
+    assert [units[results.key_of(unit(n))].of("error")[1] for n in range(3)] == approx(
         [0.1235, 1.1235, 2.1235], abs=1e-4
     )

@@ -51,10 +51,10 @@ pytestmark = mark.usefixtures("one_thread")
 
 def first_order(name="state", *changes, reaction=5.0):
     """A first-order training of a small network that reacts to its observations."""
-    found = Trainer(load_experiment(name, [*SMALL, *changes]), "cpu", 3).algorithm
+    algorithm = Trainer(load_experiment(name, [*SMALL, *changes]), "cpu", 3).algorithm
     with torch.no_grad():
-        found.network.mlp[-1].weight.mul_(reaction)
-    return found
+        algorithm.network.mlp[-1].weight.mul_(reaction)
+    return algorithm
 
 
 def decided(fo, obs):
@@ -161,21 +161,21 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, bias, yaw, monkeyp
     end = fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
     assert fo.layers.action.abs().max() < 1.0
-    found = {}
+    slopes = {}
     for name, value in end.items():
         for axis in range(value.shape[1]):
             by = torch.zeros_like(value)
             by[:, axis] = 1.0
-            found[name, axis] = backward(fo, {name: by})
+            slopes[name, axis] = backward(fo, {name: by})
     size = 0.02  # normalised
-    pairs = {key: [] for key in found}
+    pairs = {key: [] for key in slopes}
     for k, channel in itertools.product((0, 4, 8, 11), range(4)):
         step = torch.zeros_like(plan)
         step[k, :, channel] = size
         above, below = fly(plan + step), fly(plan - step)
-        for name, axis in found:
+        for name, axis in slopes:
             slope = (above[name] - below[name])[:, axis] / (2 * size)
-            pairs[name, axis].append(torch.stack([found[name, axis][k, :, channel], slope]))
+            pairs[name, axis].append(torch.stack([slopes[name, axis][k, :, channel], slope]))
     for key, pair in pairs.items():
         surrogate, simulator = torch.cat(pair, dim=1)
         if not simulator.any():
@@ -229,10 +229,10 @@ def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
     assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
     actor = Policy.load(find_policy("state")).actor(200)
-    fine, found = (protocol.throw(e, actor, 2.0, 200, seed=3) for e in (experiment, coarse))
+    fine, coarser = (protocol.throw(e, actor, 2.0, 200, seed=3) for e in (experiment, coarse))
     assert fine.success.all()
-    assert found.success.all()
-    assert abs(fine.landing_w.mean(0) - found.landing_w.mean(0)).max() < ALIKE
+    assert coarser.success.all()
+    assert abs(fine.landing_w.mean(0) - coarser.landing_w.mean(0)).max() < ALIKE
 
 
 @mark.parametrize("vehicle", ["paper", "x500"])

@@ -36,10 +36,10 @@ def flown(tmp_path_factory):
 def messages(folder, topic: str) -> list[tuple[str, int, dict]]:
     """Schema, log time [ns] and content of a topic's messages."""
     with (folder / "flight.mcap").open("rb") as file:
-        found = reader.make_reader(file).iter_messages(topics=[topic])
+        iterator = reader.make_reader(file).iter_messages(topics=[topic])
         return [
             (schema.name, message.log_time, json.loads(message.data))
-            for schema, _, message in found
+            for schema, _, message in iterator
         ]
 
 

@@ -33,11 +33,11 @@ def tables(value: typing.Any):
 @cache
 def examples() -> dict[type, typing.Any]:
     """Return one instance of each dataclass that a shipped configuration fills."""
-    found = {}
+    instances = {}
     for path in sorted(config.configs_root().rglob("*.toml")):
         loaded = config.load(kinds.schema_of(path.parent.name, path.stem), path)
-        found |= {type(table): table for table in tables(loaded)}
-    return found
+        instances |= {type(table): table for table in tables(loaded)}
+    return instances
 
 
 def numbers() -> list:

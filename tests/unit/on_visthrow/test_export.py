@@ -72,11 +72,11 @@ def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
     function.argtypes, function.restype = [floats, floats, floats], None
     obs, expected = rollout(policy)
     memories = np.zeros((THROWS, max(policy.begin(1).shape[1], 1)), np.float32)
-    found = np.empty_like(expected)
+    actions = np.empty_like(expected)
     for t in range(STEPS):
         for e in range(THROWS):
-            function(np.ascontiguousarray(obs[t, e], np.float32), memories[e], found[t, e])
-    assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
+            function(np.ascontiguousarray(obs[t, e], np.float32), memories[e], actions[t, e])
+    assert_allclose(actions, expected, rtol=0.0, atol=TOLERANCE)
 
 
 def test_the_command_writes_by_the_ending_and_refuses_others(tmp_path, capsys, refused):

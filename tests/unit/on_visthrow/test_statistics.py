@@ -22,11 +22,11 @@ the sample's skew.
 def test_interval_of_a_mean_is_the_closed_form():
     """Of many normal throws: mean +- 1.96 standard errors."""
     x = default_rng(1).normal(0.03, 0.01, 400)
-    found = st.mean(x, draws=20000)
+    interval = st.mean(x, draws=20000)
     half = 1.96 * x.std() / np.sqrt(len(x))
-    assert found.value == approx(x.mean())
-    assert found.low == approx(x.mean() - half, abs=CLOSED * half)
-    assert found.high == approx(x.mean() + half, abs=CLOSED * half)
+    assert interval.value == approx(x.mean())
+    assert interval.low == approx(x.mean() - half, abs=CLOSED * half)
+    assert interval.high == approx(x.mean() + half, abs=CLOSED * half)
 
 
 def test_two_levels_carry_the_scatter_of_the_runs():
@@ -75,10 +75,10 @@ def test_correlation_against_fisher():
     rng = default_rng(6)
     x = rng.normal(size=500)
     y = 0.8 * x + 0.6 * rng.normal(size=500)
-    found = st.correlation(x, y)
-    assert found.value == approx(stats.pearsonr(x, y).statistic)
-    ends = np.tanh(np.arctanh(found.value) + np.array([-1.96, 1.96]) / np.sqrt(497))
-    assert [found.low, found.high] == approx(ends, abs=0.008)
+    interval = st.correlation(x, y)
+    assert interval.value == approx(stats.pearsonr(x, y).statistic)
+    ends = np.tanh(np.arctanh(interval.value) + np.array([-1.96, 1.96]) / np.sqrt(497))
+    assert [interval.low, interval.high] == approx(ends, abs=0.008)
     with raises(ValueError, match="three or more pairs"):
         st.correlation(x[:2], y[:2])
 
@@ -87,11 +87,11 @@ def test_bias_splits_the_mean_square():
     rng = default_rng(7)
     miss = rng.normal([-0.05, 0.0], [0.02, 0.01], (300, 2))
     miss[:, 1] -= miss[:, 1].mean()
-    found = st.bias(miss)
-    assert found.offset**2 + found.scatter**2 == approx((miss**2).sum(1).mean())
-    assert found.scatter == approx(np.sqrt(miss.var(0).sum()))
-    assert -0.05 in found.along
-    assert found.direction == "undershoots"
+    bias = st.bias(miss)
+    assert bias.offset**2 + bias.scatter**2 == approx((miss**2).sum(1).mean())
+    assert bias.scatter == approx(np.sqrt(miss.var(0).sum()))
+    assert -0.05 in bias.along
+    assert bias.direction == "undershoots"
     assert st.bias(miss * [-1.0, 1.0] + [0.0, -0.02]).direction == "overshoots, right"
     assert st.bias(rng.normal(0.0, 0.02, (300, 2))).share < 0.05
 
