@@ -133,14 +133,14 @@ def releases(loaded: Loaded, target: float, count: int, device: str, seed: int =
     return Releases(*(part.cpu().numpy().astype(float) for part in parts))
 
 
-def row(name: str, where: str, releases: Releases) -> str:
+def row(name: str, where: str, sample: Releases) -> str:
     """A line of the table of :data:`HEAD`."""
-    points = (releases.ball_w, releases.ball_vel_w, releases.vehicle_w, releases.landing_w)
+    points = (sample.ball_w, sample.ball_vel_w, sample.vehicle_w, sample.landing_w)
     ball, vel, vehicle, landing = (np.nanmean(point, axis=0) for point in points)
-    bow = 1e3 * releases.bow
-    slack = 1e3 * releases.slack
+    bow = 1e3 * sample.bow
+    slack = 1e3 * sample.slack
     return (
-        f"| {name} | {where} | {np.nanmean(releases.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
+        f"| {name} | {where} | {np.nanmean(sample.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
         f" {vel[0]:.2f}, {vel[2]:.2f} m/s | {vehicle[0]:.3f}, {vehicle[2]:.3f} m | {landing[0]:.3f}"
         f" m | {bow.mean():.1f}, {bow.max():.1f} mm | {slack.mean():.1f}, {slack.max():.1f} mm |"
     )

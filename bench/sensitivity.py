@@ -227,8 +227,8 @@ def _report(figures: dict[str, Any]) -> Report:
 
 def _priors(row: dict[str, Any]) -> list[float]:
     """Sizes in prior deviations, infinite where there is none."""
-    sizes = [row.get(sign, {}).get("size") for sign in "+-"]
-    return [math.inf if size is None else abs(size) / row["prior_sd"] for size in sizes]
+    reached = [row.get(sign, {}).get("size") for sign in "+-"]
+    return [math.inf if size is None else abs(size) / row["prior_sd"] for size in reached]
 
 
 def _size(size: float | None) -> str:

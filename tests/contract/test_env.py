@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from sim.kernels.state import COLLISION, NONFINITE
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
-from visthrow.onboard import actions, obs
+from visthrow.onboard import actions, observations
 from visthrow.task import terminations
 from visthrow.training.env import ThrowEnv
 
@@ -28,11 +28,11 @@ def env():
 
 def test_layouts_have_the_papers_sizes():
     params = load_experiment("vision_ideal").task.observation
-    assert obs.layout_of(load_experiment("state").task.observation).dimension == 35
-    assert obs.layout_of(params).dimension == 69
-    assert obs.layout_of(replace(params, validity=False)).dimension == 61
+    assert observations.layout_of(load_experiment("state").task.observation).dimension == 35
+    assert observations.layout_of(params).dimension == 69
+    assert observations.layout_of(replace(params, validity=False)).dimension == 61
     with raises(ValueError, match="expected 'state' or 'vision'"):
-        obs.layout_of(replace(params, layout="lidar"))
+        observations.layout_of(replace(params, layout="lidar"))
 
 
 def test_actor_does_not_see_what_only_the_critic_may(env):
@@ -48,7 +48,9 @@ def test_actor_does_not_see_what_only_the_critic_may(env):
     for name, value in saved.items():
         env.views.state[name].copy_(value)
     env.views.out["payload_vel_w"] -= 1.0
-    now = obs.VEHICLE + 5 + 2  # the payload's history moved on by one entry of the same value
+    now = (
+        observations.VEHICLE + 5 + 2
+    )  # the payload's history moved on by one entry of the same value
     assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
     assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
     assert (after["critic"] - before["critic"]).abs().amax(0).count_nonzero() >= 6

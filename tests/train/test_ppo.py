@@ -227,12 +227,10 @@ def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], lis
         training.collect(i / iterations)
         training.learn(i / iterations)
         targets.append(float(training.alg.target_kl))
-    observations = training.env.draw()
+    batch = training.env.draw()
     with torch.inference_mode():
         networks = (training.network, training.average.module)
-        off = [
-            float((n(observations) - observations["actor"]).norm(dim=-1).mean()) for n in networks
-        ]
+        off = [float((n(batch) - batch["actor"]).norm(dim=-1).mean()) for n in networks]
     return off, targets
 
 

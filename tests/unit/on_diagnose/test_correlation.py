@@ -89,9 +89,9 @@ def test_white_noise_is_white():
 
 @mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
 def test_time_order_and_size_are_those_planted(colour, order):
-    correlations = estimated(flown(3, colour))
-    assert set(correlations) == {0, 1}
-    for fitted in correlations.values():
+    fits = estimated(flown(3, colour))
+    assert set(fits) == {0, 1}
+    for fitted in fits.values():
         assert fitted.order == order
         assert TIME / 2.0 < fitted.time < 2.0 * TIME
         assert fitted.share > 0.9
