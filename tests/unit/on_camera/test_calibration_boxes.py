@@ -184,7 +184,7 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
         read(path, camera="cam7")
 
 
-@mark.parametrize("found", FILES["remarked"], ids=lambda case: case["said"])
+@mark.parametrize("case", FILES["remarked"], ids=lambda case: case["said"])
 def test_numbers_that_contradict_their_label_are_named(case, tmp_path):
     path = tmp_path / "calibration"
     path.write_text(case["text"])
@@ -199,7 +199,7 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
     assert read(path)[2].model == "pinhole-radtan"
 
 
-@mark.parametrize("found", FILES["refused"], ids=lambda case: case["said"])
+@mark.parametrize("case", FILES["refused"], ids=lambda case: case["said"])
 def test_what_is_not_read_is_refused_by_its_name(case, tmp_path):
     path = tmp_path / "calibration"
     path.write_text(case["text"])

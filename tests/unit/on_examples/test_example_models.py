@@ -15,7 +15,7 @@ from examples.pendulum.swing_model import ENCODER, PendulumModel, PendulumParams
 from examples.trim.trim_model import E8, TrimModel
 from tests.flightlogs import log_at
 from tests.places import DATA
-from tests.unit.on_diagnose.test_models import found, near
+from tests.unit.on_diagnose.test_models import estimate, near
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting.explain_cli import write_report
@@ -51,7 +51,7 @@ def test_frictions_are_distinguished():
         "quadratic_drag": 0.02,
         "encoder_offset": 0.01,
     }
-    estimates = found(PendulumModel([log], SWING), [*truth])
+    estimates = estimate(PendulumModel([log], SWING), [*truth])
     assert all(near(estimates, name, size) for name, size in truth.items()), estimates
     assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
 
@@ -103,7 +103,7 @@ def test_tilt_delay_and_focal_length_are_found():
         "camera_delay": 0.06,
         "focal_scale": -0.03,
     }
-    estimates = found(model, [*truth])
+    estimates = estimate(model, [*truth])
     assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items())
 
 
