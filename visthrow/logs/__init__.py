@@ -1,7 +1,9 @@
 """Logs of any kind, opened by their ending, into :class:`visthrow.logs.flightlog.FlightLog`."""
 
+import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -37,9 +39,11 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
             pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
     """
+    from visthrow.logs.readers.autopilot_logs import converted_logs, log_of_autopilot
+
     path, ending = Path(path), Path(path).suffix.lower()
     if path.is_dir() and not (path / BAG).is_file():
-        return _read_folder(path)
+        return _read_folder(path, mapping)
     if not path.exists():
         return _read_named(path, mapping)
     if ending == ".npz":
@@ -50,9 +54,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         from visthrow.logs.readers.blackbox.channels import logs_of_blackbox
 
         return logs_of_blackbox(path)
-    if ending in AUTOPILOTS:
-        from visthrow.logs.readers.autopilot_logs import log_of_autopilot
-
+    if ending in AUTOPILOTS or (mapping is None and converted_logs([path])):
         return [log_of_autopilot(path)]
     return _read_table(path, mapping)
 
@@ -68,10 +70,18 @@ def takes_mapping(path: str | Path) -> bool:
     """
     parts = [str(path)] if Path(path).exists() else str(path).split("+")
     files = [Path(part if Path(part).exists() else part.rpartition(":")[0]) for part in parts]
-    return any(
-        (file / BAG).is_file() if file.is_dir() else file.suffix.lower() not in SELF_DESCRIBING
-        for file in files
-    )
+    return not all(map(_describes_itself, files))
+
+
+def _describes_itself(path: Path) -> bool:
+    """Tell whether a file, or a folder, needs no mapping."""
+    from visthrow.logs.readers.autopilot_logs import converted_logs
+
+    if (path / BAG).is_file():
+        return False
+    if path.is_dir():
+        return bool(converted_logs(path.iterdir())) or not _tables_in(path)
+    return path.suffix.lower() in SELF_DESCRIBING or bool(converted_logs([path]))
 
 
 def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
@@ -109,17 +119,52 @@ def _missing(path: Path) -> LogError:
     return LogError(f"{path}: {actual}; in that folder: {', '.join(siblings[:20]) or 'nothing'}")
 
 
-def _read_folder(path: Path) -> list[FlightLog]:
+def _read_folder(path: Path, mapping: TableMap | None) -> list[FlightLog]:
+    from visthrow.logs.readers.autopilot_logs import converted_logs, log_of_autopilot
+
     if (path / RUN_LOG).is_file():
         return read(path / RUN_LOG)
     logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
-    if not logs:
-        is_run = (path / RUN_TICKS).is_file()
-        expected = (
-            f"visthrow hil view {path} writes them" if is_run else "name the files themselves"
-        )
-        raise LogError(f"{path}: a folder without {RUN_LOG} or other .npz logs; {expected}")
-    return read_all(logs)
+    if logs:
+        return read_all(logs)
+    if mapping is None and (tables := converted_logs(sorted(path.iterdir()))):
+        return [log_of_autopilot(table) for table in tables]
+    if _tables_in(path):
+        return _read_table(path, mapping)
+    is_run = (path / RUN_TICKS).is_file()
+    expected = f"visthrow hil view {path} writes them" if is_run else "name the files themselves"
+    raise LogError(f"{path}: a folder without {RUN_LOG}, other .npz logs or tables; {expected}")
+
+
+def _tables_in(folder: Path) -> list[Path]:
+    from visthrow.logs.readers.recordings import READERS
+
+    endings = (*TABLES, *READERS)
+    return sorted(p for p in folder.iterdir() if p.name.lower().endswith(endings))
+
+
+def _table_of_folder(folder: Path) -> dict[str, np.ndarray]:
+    """Return the columns of a folder's tables, as of a recording whose topics they are: what their
+    names begin with alike is left out.
+    """
+    from visthrow.logs.readers.table_to_log import Columns
+
+    files = _tables_in(folder)
+    letters = takewhile(lambda column: len(set(column)) == 1, zip(*(file.name for file in files)))
+    prefix = re.sub("[A-Za-z0-9]*$", "", "".join(column[0] for column in letters))
+    columns = Columns()
+    for file in files:
+        topic = file.name.removeprefix(prefix).partition(".")[0]
+        try:
+            table = table_of(file)
+        except LogError as error:
+            columns.left_out.append(str(error))
+            continue
+        columns |= {f"{topic}:{name}": cells for name, cells in table.items()}
+        columns.left_out += [f"{topic}:{part}" for part in getattr(table, "left_out", ())]
+    if not columns:
+        raise LogError(f"{folder}: no table among its files: {'; '.join(columns.left_out)}")
+    return columns
 
 
 def table_of(path: str | Path) -> dict[str, np.ndarray]:
@@ -136,12 +181,14 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
             f"{path}: describes its own contents and needs no mapping; look at it with: visthrow"
             f" diagnose check {path}"
         )
+    if path.is_dir() and not bag and _tables_in(path):
+        return _table_of_folder(path)
     if not path.is_file() and not bag:
         parts = str(path).split("+")
         if len(parts) > 1 and Path(parts[0]).exists():
             raise LogError(
                 f"{path}: {len(parts)} files; expected one: a mapping is of one table. `check` and"
-                " `explain` join logs"
+                " `explain` join logs, and a folder of tables is one recording"
             )
         raise _missing(path)
     if path.name.lower().endswith(TABLES):

@@ -51,7 +51,7 @@ class ChannelMap(Bounded):
     # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are
     # free
     name: str
-    columns: tuple[str, ...]
+    columns: tuple[str, ...]  # "-pitch": of the column "pitch", negated
     unit: str  # of the columns
     # euler: roll, pitch, yaw; yaw is turned first. rotvec: axis times angle. matrix: nine numbers,
     # column after column
@@ -137,7 +137,7 @@ class TableMap:
     def columns(self) -> set[str]:
         """Columns that are read, of clocks and channels."""
         clocks = [self.time, *(self.clocks or {}).values()]
-        channels = [column for channel in self.channels for column in channel.columns]
+        channels = [c.removeprefix("-") for channel in self.channels for c in channel.columns]
         return {clock.column for clock in clocks} | set(channels)
 
     def entry(self, name: str) -> ChannelMap | None:

@@ -13,7 +13,7 @@ from tests.plants import paper_plant
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
-from visthrow.diagnose.inputs.proposal import propose
+from visthrow.diagnose.inputs.proposal import propose, propose_model
 from visthrow.diagnose.throw.command_mistakes import commanded
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs import read, table_of
@@ -268,6 +268,21 @@ def test_angles_that_would_turn_a_flight_over_are_in_degrees():
     assert not proposal.questions
 
 
+def test_a_pitch_that_counts_up_with_the_nose_is_negated_and_read_back():
+    """A Crazyflie's; no turn of axes does that. A path that no lean makes says no unit."""
+    columns = flight(20.0, scale=0.1)
+    angles = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, ::-1] * [1.0, -1.0, 1.0]
+    names = ("roll [rad]", "pitch [rad]", "yaw [rad]")
+    table = {"time": columns["time"]} | named("pos", columns["pos_w"]) | dict(zip(names, angles.T))
+    proposal = propose(table, "a.csv")
+    assert proposal.mapping.entry("quat_wb").columns == (names[0], f"-{names[1]}", names[2])
+    assert not proposal.left_out
+    quat = logs_of(table, proposal.mapping, "a.csv")[0]["quat_wb"].values
+    assert np.abs(np.sum(quat * columns["quat_wb"], axis=1)) == approx(1.0)
+    other = flight(20.0, seed=4, scale=0.1)["pos_w"] - [0.0, 0.0, 2.9]
+    assert asks(propose(table | named("pos", 1e2 * other), "a.csv"), "'m' with axes")
+
+
 def test_what_falls_says_its_unit_and_a_hall_what_it_can():
     throws = table_of(REAL / "jugglebot_throws" / "session7.csv.gz")
     bare = {name.removesuffix("_mm"): cells for name, cells in throws.items()}
@@ -476,11 +491,22 @@ def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     table = flown_by_motors(columns, motors, name)
     proposal = propose(table, "a.csv", mass=0.2)
     (log,) = logs_of(table, proposal.mapping, "a.csv")
-    inputs = log[proposal.flyer["input"]].values
-    thrust = np.polynomial.polynomial.polyval(inputs, proposal.flyer["thrust_map"]).sum(axis=1)
+    thrust = model_thrust(log, proposal)
     assert np.median(thrust) == approx(0.2 * 9.81, rel=0.1)
     assert thrust / np.median(thrust) == approx(share / np.median(share), rel=1e-3)
     assert proposal.flyer["motor_time_constant"] == tau
+    del columns["command"]
+    outputs = Channel(columns["time"], np.tile(motors, (4, 1)).T, "1", "none")
+    log = log_of(columns, motor_output=outputs)  # of an autopilot, which needs no mapping
+    assert np.median(model_thrust(log, propose_model(log, 0.2))) == approx(0.2 * 9.81, rel=0.1)
+    with raises(LogError, match="needs pos_w, quat_wb and one of"):
+        propose_model(log_of(columns))
+
+
+def model_thrust(log: FlightLog, proposal) -> np.ndarray:
+    """Thrust of four motors by a proposed model [N], shape (T,)."""
+    inputs = log[proposal.flyer["input"]].values
+    return np.polynomial.polynomial.polyval(inputs, proposal.flyer["thrust_map"]).sum(axis=1)
 
 
 def test_outputs_without_a_motor_are_left_out_and_a_flaps_output_becomes_a_question():

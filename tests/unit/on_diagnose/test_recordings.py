@@ -160,10 +160,20 @@ WRITERS = {
 }
 
 
-@mark.parametrize("name", WRITERS)
+def folder(path: Path) -> None:
+    """A table for each topic, whose names begin alike, and a file that is no table."""
+    path.mkdir()
+    (path / "run3_notes.txt").write_text("none")
+    for topic, name in (("pose", "pos_w"), ("imu", "acc_b")):
+        rows = np.column_stack([1e9 * TIME, COLUMNS[name]])
+        head = f"stamp,{name}.x,{name}.y,{name}.z"
+        np.savetxt(path / f"run3_{topic}.csv", rows, "%.9g", ",", header=head, comments="")
+
+
+@mark.parametrize("name", [*WRITERS, "flight"])
 def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     path = tmp_path / name
-    WRITERS[name](path)
+    WRITERS.get(name, folder)(path)
     proposal = propose(table_of(path), name)
     (log,) = read(path, proposal.mapping)
     assert {"pos_w", "acc_b"} <= set(log.channels)

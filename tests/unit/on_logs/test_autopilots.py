@@ -2,12 +2,15 @@
 
 import math
 import struct
+import tomllib
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
-from pytest import approx, fixture, mark
+from pytest import approx, fixture, importorskip, mark, raises
 
 from tests import logfiles
+from tests.places import DATA
+from visthrow.common.errors import LogError
 from visthrow.logs import read
 from visthrow.logs.check.run import check, contradictions
 
@@ -15,6 +18,7 @@ LOCAL = ["uint64_t timestamp", *(f"float {x}" for x in ["x", "y", "z", "vx", "vy
 LOCAL += [f"uint8_t {name}" for name in ["xy_valid", "z_valid", "v_xy_valid", "v_z_valid"]]
 LOCAL += ["uint8_t xy_reset_counter"]
 ROTOR_PLACES = {0: (1, 1), 1: (-1, -1), 2: (1, -1), 3: (-1, 1)}  # forward, right: PX4's X
+VEHICLES = tomllib.loads((DATA / "vehicles.toml").read_text(encoding="utf-8"))
 
 
 def swing(i):
@@ -83,33 +87,34 @@ def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, px4)
     assert any(word in text for text in rows)
 
 
+def test_the_tables_that_ulog2csv_writes_are_read_as_the_log(px4, tmp_path):
+    """By the folder, and by any of them."""
+    convert = importorskip("pyulog.ulog2csv").convert_ulog2csv
+    log = px4()
+    (tmp_path / "b").mkdir()
+    convert(str(tmp_path / "a.ulg"), None, str(tmp_path / "b"), ",", None, None)
+    for path in (tmp_path / "b", tmp_path / "b" / "a_vehicle_local_position_0.csv"):
+        (again,) = read(path)
+        assert again.channels.keys() == log.channels.keys()
+        for name, channel in log.channels.items():
+            assert again[name].time == approx(channel.time)
+            assert again[name].values == approx(channel.values, rel=1e-5)
+    path.write_text("a,b\n1,2\n")
+    with raises(LogError, match="no column 'timestamp'"):
+        read(tmp_path / "b")
+
+
 def test_a_reset_of_the_estimate_is_reported(px4):
     rows = check([px4(resets=1)])[0].rows
     assert any("reset 1 times" in row.text for row in rows if row.channel == "pos_w")
 
 
-@mark.parametrize(
-    ("parameters", "kind"),
-    [
-        ({}, None),  # six motors move
-        ({"CA_ROTOR_COUNT": 6}, "hexarotor"),
-        ({"MAV_TYPE": 13}, "hexarotor"),
-        ({"SYS_AUTOSTART": 6001}, "hexarotor"),
-        ({"SYS_AUTOSTART": 8001}, "octorotor"),
-        ({"MAV_TYPE": 1}, "plane"),
-        ({"SYS_AUTOSTART": 2100}, "plane"),
-        ({"MAV_TYPE": 20}, "VTOL"),
-        ({"CA_AIRFRAME": 2}, "VTOL"),
-        ({"CA_AIRFRAME": 5}, "rover"),
-        ({"SYS_AUTOSTART": 50000}, "rover"),
-        ({"SYS_AUTOSTART": 5001}, "quadrotor that is no X"),
-    ],
-)
+@mark.parametrize(("parameters", "kind"), VEHICLES["px4"])
 def test_motors_of_another_vehicle_are_left_out_by_its_name(parameters, kind, px4):
     motors = {("actuator_motors", 0): outputs("", "control", 12, range(6))}
     log = px4(topics=motors, parameters=parameters)
     assert "motor_command" not in log
-    if kind is None:
+    if not kind:
         left = ["actuator_motors: 6 motors move, not the four of a quadrotor"]
         assert log.meta["left_out"] == left
         return
@@ -281,21 +286,7 @@ def test_ardupilots_older_logs_count_in_milliseconds(ardupilot):
     assert log["quat_wb"].values[0, 0] == approx(math.sin(math.radians(5.0)), abs=1e-3)
 
 
-@mark.parametrize(
-    ("parameters", "firmware", "kind"),
-    [
-        ({"FRAME_CLASS": 2.0}, "ArduCopter V4.5.1", "hexarotor"),
-        ({}, "ArduPlane V4.5.1", "plane"),
-        ({"Q_ENABLE": 1.0}, "ArduPlane V4.5.1", "VTOL"),
-        ({"FRAME_CLASS": 1.0, "FRAME_TYPE": 0.0}, "ArduCopter V4.5.1", "quadrotor that is no X"),
-        ({"FRAME_CLASS": 1.0, "FRAME_TYPE": 12.0}, "ArduCopter V4.5.1", "quadrotor"),
-        (
-            {"FRAME_CLASS": 1.0, "FRAME_TYPE": 1.0, "SERVO9_FUNCTION": 33.0, "SERVO1_FUNCTION": 0},
-            "ArduCopter V4.5.1",
-            "quadrotor",
-        ),
-    ],
-)
+@mark.parametrize(("parameters", "firmware", "kind"), VEHICLES["ardupilot"])
 def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware, kind, ardupilot):
     names = ",".join(f"C{i}" for i in range(1, 15))
     formats = {

@@ -5,7 +5,7 @@ decoder.
 import gzip
 import math
 import random
-import struct
+import tomllib
 from itertools import pairwise
 from pathlib import Path
 
@@ -51,7 +51,7 @@ def packed(text: str) -> bytes:
     return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
 
 
-TWO_BITS = packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2))
+FORMS = tomllib.loads((DATA / "forms_of_logs.toml").read_text(encoding="utf-8"))
 
 
 class TestCodec:
@@ -81,32 +81,10 @@ class TestCodec:
         nine = bytes([0b10000000]) + signed_vb(7) + signed_vb(8)
         assert self.decode(blackbox_codec.TAG8_8SVB, nine, 9) == [0] * 7 + [7, 8]
 
-    @mark.parametrize(
-        ("code", "data", "values"),
-        [
-            ("3S32", TWO_BITS, [1, -2, -1]),
-            ("3S32", packed("01" + "00" + bits(7, 4) + bits(-8, 4) + bits(-1, 4)), [7, -8, -1]),
-            (
-                "3S32",
-                packed("10" + bits(31, 6) + "00" + bits(-32, 6) + "00" + bits(-1, 6)),
-                [31, -32, -1],
-            ),
-            (
-                "3S32",
-                bytes([0b11_11_01_00]) + struct.pack("<bhi", -5, -300, -(2**31)),
-                [-5, -300, -(2**31)],
-            ),
-            ("3SVARIABLE", TWO_BITS, [1, -2, -1]),
-            ("3SVARIABLE", packed("01" + bits(15, 5) + bits(-16, 5) + bits(-8, 4)), [15, -16, -8]),
-            (
-                "3SVARIABLE",
-                packed("10" + bits(-128, 8) + bits(63, 7) + bits(-64, 7)),
-                [-128, 63, -64],
-            ),
-        ],
-    )
+    @mark.parametrize(("code", "data", "values"), FORMS["codes"])
     def test_three_fields_with_a_selector(self, code, data, values):
-        assert self.decode(getattr(blackbox_codec, f"TAG2_{code}"), data, 3) == values
+        code = getattr(blackbox_codec, f"TAG2_{code}")
+        assert self.decode(code, packed(data.replace(" ", "")), 3) == values
 
     def test_four_fields_of_nibbles(self):
         chance, widths = random.Random(3), (0, 4, 8, 16)
@@ -256,19 +234,7 @@ class TestTables:
             1,
         )
 
-    @mark.parametrize(
-        ("rows", "entry", "values"),
-        [
-            ("t;v\n0;1,5\n10;2,5\n20;3,5", {}, [1.5, 2.5, 3.5]),
-            ("t\tv\n0\t1.5\n10\t2.5\n20\t3.5", {}, [1.5, 2.5, 3.5]),
-            ("t v\n0 1.5\n10   2.5\n20 3.5", {}, [1.5, 2.5, 3.5]),
-            ("t;v\n0;1.5\n10;2.5\n20;3.5", {}, [1.5, 2.5, 3.5]),
-            ("t,v\n0,1\n10,1\n20,2\n30,2\n40,3", {"held": True}, [1, 2, 3]),
-            ("t,v\n0,1\n10,2\n20,-4", dict(unit="cm", scale=2, offset=3), [0.05, 0.07, -0.05]),
-            ("t,v,v\n0,1,5\n10,2,6\n20,3,7", {"columns": ("v (2)",)}, [5, 6, 7]),
-            ("t,v\n0,1\n10,2\n20,3\n30", {}, [1, 2, 3]),  # cut while it was written
-        ],
-    )
+    @mark.parametrize(("rows", "entry", "values"), FORMS["columns"])
     def test_one_column(self, tmp_path, rows, entry, values):
         entry = {"name": "x", "columns": ("v",), "unit": "m"} | entry
         (log,) = read_rows(tmp_path, [rows], ChannelMap(**entry))

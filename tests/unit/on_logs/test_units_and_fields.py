@@ -2,7 +2,6 @@
 log: what comes out against numbers worked by hand.
 """
 
-import math
 import struct
 import tomllib
 
@@ -99,21 +98,7 @@ def test_no_field_is_untested(ending, kind):
     assert written == named
 
 
-@mark.parametrize(
-    ("title", "value", "channel", "expected"),
-    [
-        ("gyroADC[0] (deg/s)", 180.0, "rate_b", math.pi),
-        ("gyroADC[0] (rad/s)", 2.0, "rate_b", 2.0),
-        ("accSmooth[0] (g)", 0.5, "acc_b", 4.903325),
-        ("accSmooth[0] (m/s/s)", 3.0, "acc_b", 3.0),
-        ("vbatLatest (V)", 15.5, "battery_voltage", 15.5),
-        ("amperageLatest (A)", 7.5, "current", 7.5),
-        ("setpoint[0] (deg/s)", 90.0, "rate_setpoint_b", math.pi / 2),
-        ("setpoint[3]", 250.0, "throttle", 0.25),
-        ("motor[3]", 1102.5, "motor_command", 0.5),
-        ("eRPM[3]", 70.0, "motor_speed", 1000.0 * math.pi / 30),
-    ],
-)
+@mark.parametrize(("title", "value", "channel", "expected"), TABLES["decoded_blackbox"])
 def test_a_field_of_a_decoded_blackbox(title, value, channel, expected):
     """Motor 3 is ours 0; a motor of 14 poles turns 100 / 7 times for one of eRPM."""
     rest = {f"{name}[{i}]" for name in ("gyroADC", "accSmooth", "setpoint") for i in range(3)}

@@ -14,15 +14,18 @@ add_arguments = declare(__file__)
 def run(args: argparse.Namespace) -> int:
     """Read, propose, print."""
     from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.inputs.proposal import propose
-    from visthrow.logs import table_of
+    from visthrow.diagnose.inputs.proposal import propose, propose_model
+    from visthrow.logs import read, table_of, takes_mapping
 
-    proposal = propose(table_of(args.file), args.file, args.mass, args.time_unit)
+    if takes_mapping(args.file):
+        proposal = propose(table_of(args.file), args.file, args.mass, args.time_unit)
+    else:
+        proposal = propose_model(read(args.file)[0], args.mass)
     text = toml_of(proposal, Path(args.file).name)
     if args.out:
         atomic_write(args.out, text)
     print(text, end="")
-    if proposal.mapping is None:
+    if proposal.mapping is None and proposal.flyer is None:
         raise LogError(f"{args.file}: no mapping proposed; {proposal.questions[-1]}")
     return 0
 

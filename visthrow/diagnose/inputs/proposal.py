@@ -82,6 +82,24 @@ def propose(
     return proposal
 
 
+def propose_model(log: FlightLog, mass: float | None = None) -> MappingProposal:
+    """Propose a flying model for a log that needs no mapping, in place of which none stands.
+
+    ``mass``: of the vehicle alone [kg], where it was weighed.
+    Raises LogError: the log holds too little for one.
+    """
+    proposal = MappingProposal()
+    full = {name: c for name, c in log.channels.items() if np.sum(c.valid) >= 50}
+    proposal.flyer = _flyer(FlightLog(full, log.meta), proposal, mass)
+    if proposal.flyer is None:
+        raise LogError(
+            f"{log.meta.get('source')}: no flying model proposed: that needs pos_w, quat_wb and one"
+            f" of {', '.join(thrust_checks.INPUTS)}; of those that hold 50 samples it has"
+            f" {', '.join(full)}"
+        )
+    return proposal
+
+
 def _mapping(
     numbers: Table, proposal: MappingProposal, settings: dict[str, str], time_unit: str | None
 ) -> TableMap | None:
@@ -326,6 +344,8 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
     measured = name == "motor_speed"  # what the rotors do, behind their lag
     power = [0.0, 0.0, first] if measured else [0.0, first, 0.0]
+    if name in thrust_checks.PULSES and thrust_checks.are_pulses(log[name].values):
+        power[0] = -first * thrust_checks.IDLE_PULSE
     volts = log["battery_voltage"].values if "battery_voltage" in log else [1.0]
     flyer = {
         "input": name,

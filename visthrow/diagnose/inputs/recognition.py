@@ -191,17 +191,29 @@ class Recognition:
         units = ("rad", "deg") if open_unit else (entry.unit,)
         orders = ("wxyz", "xyzw") if open_order else (entry.order,)
         worlds = ("", Y_UP if self.settings else NED)
+        readings_of_columns = [(entry.columns, group.values, axes) for axes in worlds]
+        named_nose_up = False
+        if entry.kind == "euler":
+            roll, pitch, yaw = entry.columns
+            negated = group.values * [1.0, -1.0, 1.0]
+            readings_of_columns.append(((roll, f"-{pitch}", yaw), negated, ""))
+            named_nose_up = bool(PATTERNS["nose_up"].search(pitch))
         ways: list[Attitude | None] = []
-        for unit, order, axes in product(units, orders, worlds):
-            tried = replace(entry, unit=unit, order=order, axes=axes, body_axes=axes)
-            channel = make_channel(self.time, group.values, tried, "table")[0]
+        for unit, order, reading in product(units, orders, readings_of_columns):
+            columns, values, axes = reading
+            tried = replace(
+                entry, columns=columns, unit=unit, order=order, axes=axes, body_axes=axes
+            )
+            channel = make_channel(self.time, values, tried, "table")[0]
             if not np.any(channel.valid):
                 continue
-            doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
+            nose_up = columns != entry.columns
+            unusual = (order != entry.order) + (bool(axes) != motive)
+            doubt = _UNUSUAL * (unusual + 2.0 * (nose_up != named_nose_up))
             doubt += _TILTED * (physics.median_tilt(channel.samples().values) > physics.STEEPEST)
             doubt += _TILTED * self._leans_by_accelerometers(channel, axes)
             words = [unit] * open_unit + [f"order {order}"] * open_order
-            words.append(f"axes {axes or 'x,y,z'}")
+            words.append(f"axes {axes or 'x,y,z'}" + " and pitch negated" * nose_up)
             ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
         return ways
 

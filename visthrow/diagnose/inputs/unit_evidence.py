@@ -5,7 +5,7 @@ thrust carries.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -61,9 +61,9 @@ class Attitude:
     words: str = ""  # by which it differs from the other ways
 
     @property
-    def kind(self) -> tuple[str, str]:
-        """Order of a quaternion and axes of the world: all but the unit of angles."""
-        return self.entry.order, self.entry.axes
+    def kind(self) -> tuple[str, str, tuple[str, ...]]:
+        """Order of a quaternion, axes of the world and signs: all but the unit of angles."""
+        return self.entry.order, self.entry.axes, self.entry.columns
 
 
 @dataclass(frozen=True)
@@ -87,10 +87,11 @@ class Lean(NamedTuple):
 
     size: float  # what the lean accelerates it by [m/s^2]
     times: float  # how many times that it accelerates by in its own unit; 0: not known
+    correlation: float  # of the two
     nats: float  # for their going together
 
 
-NO_LEAN = Lean(0.0, 0.0, 0.0)
+NO_LEAN = Lean(0.0, 0.0, 0.0, 0.0)
 
 
 def readings(
@@ -112,7 +113,7 @@ def readings(
     fall = by_fall(time, path)
     attitudes = list(attitudes)
     leans = [NO_LEAN if way is None else _weigh_by_lean(time, path, way) for way in attitudes]
-    together: dict[tuple[str, str] | None, float] = {}  # angles in whatever unit
+    together: dict[Any, float] = {}  # by kind: angles in whatever unit
     kinds = [way.kind if way is not None else None for way in attitudes]
     for kind, lean in zip(kinds, leans):
         together[kind] = max(together.get(kind, 0.0), lean.nats)
@@ -121,6 +122,9 @@ def readings(
         if lean.times > 0.0:
             decades.append(abs(np.log10(UNITS[unit][1] * lean.times)))
     leaning = min(decades, default=np.inf) < _DECADES and max(x.size for x in leans) > _LEANS
+    correlation = max((lean.correlation for lean in leans if lean.nats >= SURE), default=0.0)
+    leaning = leaning and correlation > 0.0
+    slack = -np.log(correlation) if leaning else 0.0  # by which noise of either changes their ratio
     listed = []
     for attitude, kind, lean in zip(attitudes, kinds, leans):
         below = 0.0
@@ -135,7 +139,7 @@ def readings(
                 doubt -= together[kind]
             if leaning and lean.times > 0.0:
                 times = UNITS[unit][1] * lean.times
-                doubt += _huber(np.log(times) / _SCATTER)
+                doubt += _huber(max(0.0, abs(np.log(times)) - slack) / _SCATTER)
                 why = f"{unit} by gravity: it accelerates by {times:.2g} times what its lean makes"
             elif fall:
                 why = f"{unit} by gravity: a part of it falls freely"
@@ -161,7 +165,7 @@ def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
     independent = np.ptp(stamps) / _SPAN
     nats = -0.5 * independent * np.log(1.0 - correlation**2)
     times = np.linalg.norm(moved) / np.linalg.norm(lean)
-    return Lean(np.linalg.norm(lean) / np.sqrt(len(stamps)), times, nats)
+    return Lean(np.linalg.norm(lean) / np.sqrt(len(stamps)), times, correlation, nats)
 
 
 def _huber(deviations: float) -> float:

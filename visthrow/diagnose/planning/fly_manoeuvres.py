@@ -63,7 +63,9 @@ LOGGED = {
     "command": ("N, rad/s", "body"),
     "release_command": ("1",),
     "thrust_command": ("N",),
+    "throttle": ("1",),
     "motor_command": ("1",),
+    "motor_output": ("1",),
     "motor_speed": ("rad/s",),
 }
 """Channel of a simulated log -> unit and frame."""
@@ -294,7 +296,7 @@ class SimulatedFlight:
 
     def _input(self, params: FlyerParams) -> dict[str, Channel]:
         """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
-        if params.input in ("command", "thrust_command"):
+        if params.input in ("command", "thrust_command", "throttle"):
             values = command_of(params.thrust_map, self.commands[:, :1])
             if params.input == "command":
                 values = np.hstack((values, self.commands[:, 1:]))

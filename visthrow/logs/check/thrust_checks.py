@@ -33,6 +33,7 @@ INPUTS = (
     "motor_output",
     "pwm",
 )
+PULSES = ("motor_output", "pwm")  # or numbers from 0 up
 ROTORS = ("motor_speed", "motor_command", "motor_output", "pwm")
 NAMES = ("front left", "front right", "rear left", "rear right")
 
@@ -86,9 +87,14 @@ def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Sam
         values = sum(c * values**i for i, c in enumerate(vehicle.thrust_map))
     elif name == "motor_speed":
         values = values**2
-    elif name in ("motor_output", "pwm") and IDLE_PULSE - 200.0 < np.median(values) < 2300.0:
+    elif name in PULSES and are_pulses(values):
         values = np.maximum(values - IDLE_PULSE, 0.0)
     return name, Samples(driver.time, np.sum(values, axis=1, keepdims=True))
+
+
+def are_pulses(outputs: np.ndarray) -> bool:
+    """Tell whether outputs to motors are lengths of pulses [us]."""
+    return bool(IDLE_PULSE - 200.0 < np.median(outputs) < 2300.0)
 
 
 def follows(log: FlightLog, name: str) -> float | None:

@@ -6,7 +6,7 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 forward, left, up."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -22,6 +22,8 @@ from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.messages import (
     Fields,
     Messages,
+    name_converted,
+    read_converted,
     read_dataflash,
     read_telemetry,
     read_ulog,
@@ -103,8 +105,20 @@ READERS = {
     ".ulg": (read_ulog, "ulog"),
     ".bin": (read_dataflash, "dataflash"),
     ".tlog": (read_telemetry, "telemetry"),
+    ".csv": (read_converted, "ulog"),
 }
 """Ending -> reader of the messages, and the kind of log."""
+
+
+def converted_logs(files: Iterable[Path]) -> list[Path]:
+    """Return one table of each PX4 log among tables, which ``ulog2csv`` wrote."""
+    topics = {tap.message for tap in fields_of_autopilots()["taps"]["ulog"]}
+    logs: dict[str, Path] = {}
+    for file in files:
+        log, topic, _ = name_converted(file, topics)
+        if topic:
+            logs.setdefault(log, file)
+    return list(logs.values())
 
 
 def log_of_autopilot(path: str | Path) -> FlightLog:

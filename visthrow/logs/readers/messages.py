@@ -83,18 +83,52 @@ def read_ulog(path: str | Path, names: Collection[str]) -> Messages:
     messages = Messages(Path(path), "ulog")
     for data in log.data_list:
         if "timestamp" in data.data:
-            arrival = data.data["timestamp"] * 1e-6
-            sample = data.data.get("timestamp_sample")
-            time = arrival if sample is None else np.where(sample > 0, sample * 1e-6, arrival)
-            messages.fields[data.name, data.multi_id] = {
-                **data.data,
-                "time": time,
-                "arrival": arrival,
-            }
+            messages.fields[data.name, data.multi_id] = _stamped(data.data)
     drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in log.dropouts]
     messages.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
     messages.parameters = {str(name): float(x) for name, x in log.initial_parameters.items()}
     return messages
+
+
+def _stamped(data: Fields) -> Fields:
+    """Add when a topic of PX4 was measured and when it was written to its fields."""
+    arrival = data["timestamp"] * 1e-6
+    sample = data.get("timestamp_sample")
+    time = arrival if sample is None else np.where(sample > 0, sample * 1e-6, arrival)
+    return {**data, "time": time, "arrival": arrival}
+
+
+def read_converted(path: str | Path, names: Collection[str]) -> Messages:
+    """Read topics of a PX4 log that ``ulog2csv`` wrote, a table each: ``LOG_TOPIC_INSTANCE.csv``.
+    It writes no parameters.
+
+    ``path``: of one of the tables. Raises LogError: one cannot be read, or lacks the stamps.
+    """
+    from visthrow.logs.readers.table_to_log import read_table
+
+    path = Path(path)
+    messages = Messages(path, "ulog")
+    log = name_converted(path, names)[0]
+    for file in sorted(path.parent.glob("*.csv")):
+        name, topic, instance = name_converted(file, names)
+        if topic and name == log:
+            data = read_table(file)
+            if "timestamp" not in data:
+                raise LogError(f"{file}: no column 'timestamp'; expected a table of ulog2csv")
+            messages.fields[topic, instance] = _stamped(data)
+    return messages
+
+
+def name_converted(path: Path, names: Collection[str]) -> tuple[str, str, int]:
+    """Return log, topic and instance of a table that ``ulog2csv`` wrote, ("", "", 0) where its
+    name ends in none of these topics.
+    """
+    stem, _, instance = path.stem.rpartition("_")
+    topics = [name for name in names if stem.endswith(f"_{name}")]
+    if path.suffix != ".csv" or not instance.isdecimal() or not topics:
+        return "", "", 0
+    topic = max(topics, key=len)
+    return stem.removesuffix(f"_{topic}"), topic, int(instance)
 
 
 def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:

@@ -204,6 +204,9 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
 
 
 def _numbers(table: Table, name: str, source: str) -> np.ndarray:
+    """Return the numbers of a column, negated where a minus stands before its name."""
+    if name not in table and name[:1] == "-":
+        return -_numbers(table, name[1:], source)
     if name not in table:
         raise LogError(f"{source}: no column '{name}'; {suggest(name, table)}")
     if table[name].dtype.kind not in "fiub":

@@ -92,7 +92,9 @@ class FlyerParams(QuadrotorParams):
     """
 
     # channel of the commands
-    input: Literal["motor_command", "motor_speed", "thrust_command", "command"]
+    input: Literal[
+        "motor_command", "motor_speed", "motor_output", "thrust_command", "throttle", "command"
+    ]
     position: str  # channel of the measured position
     attitude: str  # channel of the measured attitude
     drag_xy: NotNegative  # rotor drag [kg/s]
