@@ -36,10 +36,10 @@ PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
 LEAST = 4.0
 
 
-def chosen_of(statistics, days=(), effects=EFFECTS, priors=PRIORS, least=LEAST):
+def chosen_of(statistics, effects=EFFECTS, priors=PRIORS, least=LEAST):
     """Return the best set of candidates, and the deviations of its random shares in their unit."""
-    offered = shared(effects) + random_shares(effects, priors, statistics, days)
-    linear = Linear(statistics, priors, offered, lambda s: sum(least + c.penalty for c in s), days)
+    offered = shared(effects) + random_shares(effects, priors, statistics)
+    linear = Linear(statistics, priors, offered, lambda s: sum(least + c.penalty for c in s))
     near = window(linear, {NOTHING})
     best = max(near, key=near.get)
     sizes = {
@@ -84,18 +84,14 @@ def campaign(rng, days, by_day, by_flight):
     """
     statistics, floor = flights(rng, 3 * days, release_lag=by_flight), PRIORS.floor[0]
     offsets = np.repeat(rng.normal(size=days) * by_day / floor, 3)
-    return (
-        replace(
-            statistics, score=statistics.score + statistics.information[:, :, 0] * offsets[:, None]
-        ),
-        np.repeat(np.arange(days), 3).tolist(),
-    )
+    score = statistics.score + statistics.information[:, :, 0] * offsets[:, None]
+    return replace(statistics, score=score, days=np.repeat(np.arange(days), 3))
 
 
 def on_days(rng, *deviations) -> set[str]:
     """Return the groups with a random share of the release's lag."""
-    statistics, days = campaign(rng, 5, *deviations)
-    return {c.group for c in chosen_of(statistics, days)[0] if c.name == "lag_jitter"}
+    statistics = campaign(rng, 5, *deviations)
+    return {c.group for c in chosen_of(statistics)[0] if c.name == "lag_jitter"}
 
 
 def test_what_is_drawn_anew_each_day_drifts():
@@ -132,19 +128,19 @@ def share(j, group, size):
 
 def test_a_mean_is_as_certain_as_its_number_of_days():
     """Three flights of a day give no more information on the days' common size than one does."""
-    statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
-    by_flight, by_day = (freed(statistics, share(0, who, 6.0), days) for who in (FLIGHT, DAY))
+    statistics = campaign(default_rng(10), 5, 0.012, 0.0)
+    by_flight, by_day = (freed(statistics, share(0, who, 6.0)) for who in (FLIGHT, DAY))
     assert len(by_day.flights) == 5
     sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
     assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
 
 
 def test_shares_of_days_come_before_those_of_flights():
-    statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
+    statistics = campaign(default_rng(11), 5, 0.0, 0.0)
     moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
     statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
     shares = estimate_shares(
-        statistics, np.zeros(len(NAMES)), share(0, FLIGHT, 1.0) | share(0, DAY, 10.0), days
+        statistics, np.zeros(len(NAMES)), share(0, FLIGHT, 1.0) | share(0, DAY, 10.0)
     )
     assert_allclose(shares[:, 0], moved, atol=0.5)
     assert np.all(shares[:, 1:] == 0.0)

@@ -119,6 +119,7 @@ class Statistics:
     square: ndarray  # r' V^-1 r + log det V, shape (F,)
     samples: ndarray  # shape (F,)
     theta: ndarray  # shape (K,)
+    days: Sequence[int] = ()  # of each flight; none where the logs do not say
 
     @cached_property
     def absolute(self) -> "Statistics":
@@ -126,10 +127,12 @@ class Statistics:
         return self.about(np.zeros(len(self.theta)))
 
     def about(self, theta: ndarray) -> "Statistics":
-        """Return the statistics of the residuals extrapolated to other sizes, shape (K,)."""
-        change = self.theta - theta
-        score = self.score + self.information @ change
-        square = self.square + (self.score + score) @ change
+        """Return the statistics of the residuals extrapolated to other sizes, shape (K,), or to
+        those of each row, shape (F, K).
+        """
+        change = np.broadcast_to(self.theta - theta, self.score.shape)
+        score = self.score + (self.information @ change[..., None])[..., 0]
+        square = self.square + ((self.score + score) * change).sum(1)
         return replace(self, score=score, square=square, theta=theta)
 
     def first(self, count: int) -> "Statistics":

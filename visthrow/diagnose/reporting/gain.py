@@ -233,7 +233,5 @@ def _nats(work: Work, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
     plain = work.before.by_window.by(cross.groups)
     named = work.after.by_window.by(cross.groups)
-    change = cross.trained - work.after.theta
-    quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
-    square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic
+    square = named.about(cross.trained).square
     return 0.5 * (plain.square.sum() - square.sum()) / named.samples.sum()

@@ -81,7 +81,6 @@ def random_shares(
     effects: Sequence[Effect],
     priors: Priors,
     statistics: Statistics,
-    days: Sequence[int],
     all_effects: bool = True,
 ) -> list[Candidate]:
     """Return what flights, or days, may have for themselves, where at least two of them show it.
@@ -89,11 +88,10 @@ def random_shares(
     Args:
         effects: of the model, without terms of laws, shape (K,).
         statistics: of the flights.
-        days: of each flight, by its number; none where the logs do not say.
         all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
-    groups = _informative(flown, [days[f] for f in statistics.flights.tolist()] if days else [])
+    groups = _informative(flown, statistics.days)
     offered = []
     for effect, penalty in _varying(effects):
         named = effect.name not in effect.of
@@ -239,10 +237,10 @@ def relinearised_per_flight(
     ``theta``: estimated sizes, in floors; ``simulate``: simulates the flights at other sizes, in
     floors, or returns None where that fails.
     """
-    column = statistics.information[:, j]
-    misfit = statistics.score[:, j] - column @ (theta - statistics.theta)
-    flown = np.flatnonzero(column[:, j] > 0.0)
-    reach = np.abs(misfit[flown] / column[flown, j]).max(initial=0.0)
+    information = statistics.information[:, j, j]
+    misfit = statistics.about(theta).score[:, j]
+    flown = np.flatnonzero(information > 0.0)
+    reach = np.abs(misfit[flown] / information[flown]).max(initial=0.0)
     if INEXACT * reach < 1.0:  # the derivative is off by less than a floor
         return statistics
     unit = np.eye(len(theta))[j]
@@ -368,15 +366,15 @@ def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) ->
     return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square
 
 
-def freed(statistics: Statistics, shares: Shares, days: Sequence[int] = ()) -> Statistics:
+def freed(statistics: Statistics, shares: Shares) -> Statistics:
     """Statistics of what flights, or days, share: the shares that each has of its own are
     integrated out.
 
-    ``days``: of each flight, by its number. Where days have shares, what is returned is of days."""
+    Where days have shares, what is returned is of days."""
     of_flights = integrated(statistics, _of_rows(shares, statistics.flights))
     if not drifting(shares):
         return of_flights
-    of_days = by_day(of_flights, days)
+    of_days = of_flights.by(statistics.days)
     return integrated(of_days, _of_rows(shares, of_days.flights, DAY))
 
 
@@ -394,11 +392,6 @@ def _of_rows(shares: Shares, numbers: ndarray, group: str = FLIGHT) -> Deviation
             has_share = (c.group != EVENT) | (numbers == c.flight)
             for j, deviation in zip(c.columns, c.deviations):
                 yield j, size * deviation * has_share
-
-
-def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
-    """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
-    return statistics.by([days[f] for f in statistics.flights.tolist()])
 
 
 def integrated(statistics: Statistics, deviations: Deviations) -> Statistics:
@@ -433,9 +426,7 @@ def _unit_shares(
     return columns, root, part, np.eye(len(pairs)) + part[..., columns] * root[:, None]
 
 
-def estimate_shares(
-    statistics: Statistics, theta: ndarray, shares: Shares, days: Sequence[int]
-) -> ndarray:
+def estimate_shares(statistics: Statistics, theta: ndarray, shares: Shares) -> ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in
     floors, shape (F, K).
 
@@ -444,16 +435,15 @@ def estimate_shares(
     sizes = np.zeros(statistics.score.shape)
     of_flights = list(_of_rows(shares, statistics.flights))
     if drifting(shares):
-        of_days = by_day(integrated(statistics, of_flights), days)
-        row = np.searchsorted(of_days.flights, [days[f] for f in statistics.flights.tolist()])
+        of_days = integrated(statistics, of_flights).by(statistics.days)
+        row = np.searchsorted(of_days.flights, statistics.days)
         sizes += _shares(of_days, theta, _of_rows(shares, of_days.flights, DAY))[row]
     return sizes + _shares(statistics, theta + sizes, of_flights)
 
 
 def _shares(statistics: Statistics, theta: ndarray, deviations: Deviations) -> ndarray:
     """Return the most probable shares of each row, shape (F, K), beside its sizes ``theta``."""
-    columns, root, part, precision = _unit_shares(statistics, deviations)
-    known = part @ np.broadcast_to(theta - statistics.theta, statistics.score.shape)[..., None]
-    off = root[..., None] * statistics.score[:, columns, None] - known
-    sizes = root * np.linalg.solve(precision, off)[..., 0]
+    columns, root, _, precision = _unit_shares(statistics, deviations)
+    off = root * statistics.about(theta).score[:, columns]
+    sizes = root * np.linalg.solve(precision, off[..., None])[..., 0]
     return sizes @ np.eye(len(statistics.theta))[columns]

@@ -163,10 +163,8 @@ def borne_out(
     that of the flights' scatter (Student, over those that can tell), or of this chance where it is
     wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
     sizes that all flights gave, shape (K,)."""
-    information = statistics.information
-    promised = 0.5 * np.einsum("i,fij,j->f", theta, information, theta)
-    quadratic = np.einsum("fi,fij,fj->f", trained, information, trained)
-    brought = np.einsum("fi,fi->f", trained, statistics.absolute.score) - 0.5 * quadratic
+    promised = 0.5 * theta @ statistics.information @ theta
+    brought = 0.5 * (statistics.absolute.square - statistics.about(trained).square)
     total = promised.sum()
     if total <= 0.0:
         return 0.0, np.nan, np.nan

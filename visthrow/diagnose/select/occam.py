@@ -32,7 +32,6 @@ from visthrow.diagnose.select.candidates import (
     Candidate,
     Names,
     Shares,
-    by_day,
     columns_of,
     drifting,
     evidence_of,
@@ -61,12 +60,10 @@ class Linear:
         priors: Priors,
         candidates: Sequence[Candidate],
         penalty: Callable[[Names], float],
-        days: Sequence[int] = (),
     ) -> None:
         """Keep what values are made of; ``penalty``: of a set [nats]."""
         self.statistics = statistics
         self.priors = priors
-        self.days = days
         self.penalty = penalty
         self.plain = [c for c in candidates if c.group == ALL and priors.visible[c.columns[0]]]
         self.random = [c for c in candidates if c.group != ALL]
@@ -117,7 +114,7 @@ class Linear:
         statistics = freed(self.statistics, flights)
         nats = []
         for shares in (days, *({**days, c: size} for size in sizes.tolist())):
-            varied = freed(statistics, shares, self.days)
+            varied = freed(statistics, shares)
             nats.append(evidence_of(varied, self.priors, active))
         return sizes, np.array(nats[1:]) - nats[0]
 
@@ -134,7 +131,7 @@ class Linear:
         return self._values[chosen]
 
     def _free(self, chosen: Names) -> Statistics:
-        return freed(self.statistics, self.shares(chosen)[0], self.days)
+        return freed(self.statistics, self.shares(chosen)[0])
 
     def total(self, chosen: Names) -> Posterior:
         """Return what all flights say beside a set's random shares."""
@@ -185,7 +182,7 @@ class Linear:
 
     def _promises(self, group: str, members: Sequence[Candidate], theta: ndarray) -> list[float]:
         """Return the nats that random shares of one group promise beside these sizes [floors]."""
-        flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
+        flights = self.statistics.by(self.statistics.days) if group == DAY else self.statistics
         precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
         misfit = (flights.about(theta).score) ** 2 / precision
         counts = [len(c.columns) for c in members]

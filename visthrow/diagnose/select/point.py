@@ -57,7 +57,6 @@ class Problem:
     correlated: Mapping[int, Correlation] = field(
         default_factory=dict
     )  # channels whose noise is not white
-    days: tuple[int, ...] = ()  # of each flight, by its number; none where the logs do not say
     terms: tuple[
         TermEffect, ...
     ] = ()  # of laws: further effects, whose columns follow from those of the latent forces
@@ -68,7 +67,7 @@ class Problem:
         """The problem of some of a model's windows, with the correlation of their
         channels' noise.
         """
-        plain = Problem(model, tuple(numbers), days=tuple(model.days))
+        plain = Problem(model, tuple(numbers))
         slabs = plain.priors.slab * plain.priors.floor
         kept = [windows[i] for i in numbers]
         return replace(plain, correlated=correlations(kept, slabs, len(model.channels)))
@@ -149,7 +148,7 @@ class Point:
         """Return the statistics of what flights share: each flight's random shares are integrated
         out.
         """
-        return freed(self.plain, self.shares, self.problem.days)
+        return freed(self.plain, self.shares)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -182,13 +181,17 @@ def regathered(point: Point, integrals: Integrals | None = None, **changes: Any)
     changed = replace(point, **changes)
     if integrals is None:
         integrals = Integrals(changed.grams, changed.noise)
-    plain = _sum_by_flight(integrals, changed.grams, changed.theta)
+    plain = _sum_by_flight(changed.problem, integrals, changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
 
 
-def _sum_by_flight(integrals: Integrals, grams: Sequence[Gram], theta: ndarray) -> Statistics:
+def _sum_by_flight(
+    problem: Problem, integrals: Integrals, grams: Sequence[Gram], theta: ndarray
+) -> Statistics:
     statistics = integrals.statistics(grams, theta)
-    return statistics.by(statistics.flights)
+    by_flight = statistics.by(statistics.flights)
+    days = problem.model.days
+    return replace(by_flight, days=[days[f] for f in by_flight.flights] if days else ())
 
 
 def linearise(
@@ -222,7 +225,7 @@ def linearise(
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
-    statistics = _sum_by_flight(integrals, grams, theta)
+    statistics = _sum_by_flight(problem, integrals, grams, theta)
     return Point(
         problem,
         theta,
@@ -413,9 +416,7 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
     """Return the inner products of a point's windows at ``theta``, and with each flight's random
     shares beside it.
     """
-    shares = (
-        estimate_shares(point.plain, theta, point.shares, point.problem.days) + theta - point.theta
-    )
+    shares = estimate_shares(point.plain, theta, point.shares) + theta - point.theta
     if not shares.any():
         return list(point.grams)
     row = np.searchsorted(point.plain.flights, [gram.flight for gram in point.grams])

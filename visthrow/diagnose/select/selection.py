@@ -101,9 +101,7 @@ class Selector:
     def _offer(self) -> None:
         problem = self.problem
         flown = self.nominal.plain
-        random = random_shares(
-            problem.model.effects, problem.priors, flown, problem.days, self._every
-        )
+        random = random_shares(problem.model.effects, problem.priors, flown, self._every)
         self.candidates = shared(problem.effects) + random
         self._linear.clear()
 
@@ -137,9 +135,7 @@ class Selector:
         """Return the values of sets by the statistics of a point."""
         problem = self.problem
         if point not in self._linear:
-            self._linear[point] = Linear(
-                point.plain, problem.priors, self.candidates, self.penalty, problem.days
-            )
+            self._linear[point] = Linear(point.plain, problem.priors, self.candidates, self.penalty)
         return self._linear[point]
 
     def run(self, begin: Names = NOTHING) -> "Selector":
@@ -343,7 +339,7 @@ class Selector:
         sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
-        shares = estimate_shares(point.plain, point.theta, point.shares, self.problem.days)
+        shares = estimate_shares(point.plain, point.theta, point.shares)
         sizes = point.theta + shares
         outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
         if np.any(outside & (sizes != 0.0)):

@@ -29,7 +29,6 @@ from visthrow.diagnose.select.candidates import (
     Shares,
     as_random,
     between_flights,
-    by_day,
     columns_of,
     estimate_shares,
     freed,
@@ -179,7 +178,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
         elif len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
         fixed_shares = {o: size for o, size in best.point.shares.items() if o != c}
-        linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
+        linear = Linear(statistics, priors, (), lambda _: 0.0)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
         # single flights that were found to differ may leave nothing that varies among all
@@ -221,7 +220,8 @@ def share_verdict(
         threshold: of evidence [nats].
     """
     sizes, nats = linear.profile(chosen, fixed_shares, c)
-    flights = by_day(linear.statistics, linear.days) if c.group == DAY else linear.statistics
+    statistics = linear.statistics
+    flights = statistics.by(statistics.days) if c.group == DAY else statistics
     informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
     count = int(informative.sum())
     reach = sizes * effect.prior_sd
@@ -245,7 +245,7 @@ def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) ->
     statistics = point.plain
     for j in sorted(varying):
         statistics = _straight(replace(point, plain=statistics), active, j)
-    shared = freed(statistics, point.shares, point.problem.days)
+    shared = freed(statistics, point.shares)
     return replace(point, plain=shared, shares={})
 
 
@@ -337,7 +337,7 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
     """Return by how much each effect of one flight alone differs there from all flights' size."""
-    shares = estimate_shares(point.plain, point.theta, point.shares, point.problem.days)
+    shares = estimate_shares(point.plain, point.theta, point.shares)
     shares *= point.problem.priors.floor
     row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
     events = [c for c in chosen if c.group == EVENT]
