@@ -64,8 +64,8 @@ class SavedDiagnosis:
         for row in self.report.get("scatter") or []:
             means = row.get("mean", {})
             for name in row["of"] if row["found"] else ():
-                theta.setdefault(name, float(means.get(name, 0.0)))
-                variance[name] = variance.get(name, 0.0) + float(row["size"]) ** 2
+                theta.setdefault(name, means.get(name, 0.0))
+                variance[name] = variance.get(name, 0.0) + row["size"] ** 2
         whole = np.diag(list(variance.values()))
         whole[:count, :count] += np.reshape(covariance, (count, count))
         return theta, whole

@@ -58,8 +58,8 @@ class FitResult:
 
     def interval(self, i: int) -> tuple[float, float]:
         """95 % interval of one of them."""
-        half = 1.96 * float(np.sqrt(self.covariance[i, i]))
-        return float(self.theta[i]) - half, float(self.theta[i]) + half
+        half = 1.96 * np.sqrt(self.covariance[i, i])
+        return self.theta[i] - half, self.theta[i] + half
 
 
 def fit(model: Model, free: Sequence[str]) -> FitResult:
@@ -105,7 +105,7 @@ def _rms(model: Model, windows: Sequence[Window]) -> dict[str, float]:
     channel = np.concatenate([w.channel for w in windows])
     squares = np.concatenate([w.residual for w in windows]) ** 2
     return {
-        name: float(np.sqrt(np.mean(squares[channel == i])))
+        name: np.sqrt(np.mean(squares[channel == i]))
         for i, name in enumerate(model.channels)
         if np.any(channel == i)
     }

@@ -20,7 +20,6 @@ from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effec
 from visthrow.diagnose.models.law_terms import Term, carries, term_of
 from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
-from visthrow.diagnose.models.thrust_map import command_of as command_of
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import on_grid as on_grid
@@ -279,7 +278,7 @@ class NumericModel(Model, ABC):
         Raises LogError for an effect that it does not know.
         """
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
-        sizes = np.array([float(theta.get(name, 0.0)) for name in self.numbers])
+        sizes = np.array([theta.get(name, 0.0) for name in self.numbers])
         total: ndarray = self._base + sizes
         return total
 
@@ -467,6 +466,19 @@ def take_samples(channel: Channel, params: Any, start: float) -> tuple[ndarray, 
     inside = (channel.time >= start) & (channel.time < start + params.window)
     rows = np.flatnonzero(channel.valid & inside)[:: params.every]
     return channel.time[rows], channel.values[rows].astype(float).reshape(len(rows), -1)
+
+
+def command_of(thrust_map: Sequence[float], thrust: ndarray) -> ndarray:
+    """Return the command at which a map gives a thrust.
+
+    ``thrust_map``: thrust by powers 0, 1, 2 of the command [N]; ``thrust``: [N], of any shape.
+    """
+    constant, linear, quadratic = thrust_map
+    if quadratic == 0.0:
+        return (thrust - constant) / linear
+    inner = linear**2 - 4.0 * quadratic * (constant - thrust)
+    root: ndarray = np.sqrt(np.maximum(inner, 0.0))
+    return (root - linear) / (2.0 * quadratic)
 
 
 def halves(steps: int) -> ndarray:

@@ -51,14 +51,18 @@ class StandModel(NumericModel):
     @cached_property
     def middle_speed(self) -> float:
         """Return the median rotor speed [rad/s]."""
-        return float(np.median(np.concatenate([s.data["speed"] for s in self.stretches])))
+        return np.median(np.concatenate([s.data["speed"] for s in self.stretches]))
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class: the settled steps of a test are one window."""
         p = self.params
         if len({len(log[name].time) for name in NEEDED}) != 1:
             return []
-        rows = settled(log, p)
+        # speed [rad/s], thrust [N], voltage [V] and current [A] of steps that can be used
+        rows = np.column_stack([log[name].values.astype(float) for name in NEEDED])
+        lowest = p.lowest_speed, 0.0, 1.0, 0.0
+        valid = np.all([log[name].valid for name in NEEDED], axis=0)
+        rows = rows[valid & np.all(rows > lowest, axis=1)]
         if len(rows) < 4:
             return []
         speed, thrust, volts, current = rows.T[..., None]
@@ -89,14 +93,3 @@ class StandModel(NumericModel):
         share = 1.0 + self.pushes_at(lanes, np.linspace(0.0, 1.0, len(speed)))
         currents = (volts - root) / (2.0 * ohm)
         return np.concatenate([thrust * share[..., 0].T, currents * share[..., 1].T], axis=1)
-
-
-def settled(log: FlightLog, params: StandParams) -> ndarray:
-    """Speed [rad/s], thrust [N], voltage [V] and current [A] of the steps that can be used, shape
-    (N, 4).
-    """
-    rows = np.column_stack([log[name].values.astype(float) for name in NEEDED])
-    good = np.all([log[name].valid for name in NEEDED], axis=0)
-    # of speed [rad/s], thrust [N], voltage [V] and current [A]
-    lowest = params.lowest_speed, 0.0, 1.0, 0.0
-    return rows[good & np.all(rows > lowest, axis=1)]

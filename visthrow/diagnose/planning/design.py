@@ -81,7 +81,7 @@ class Limits:
 
     def hold(self, path: ndarray) -> bool:
         """Tell whether a path keeps within them; its rows are ``PERIOD`` apart, shape (N, 3)."""
-        return bool(np.all(_extremes(path) <= self._most + ROUNDING))
+        return np.all(_extremes(path) <= self._most + ROUNDING)
 
     def share(self, path: ndarray, added: ndarray) -> float:
         """Largest share of a further way, 1 at most, with which a path keeps within them."""
@@ -279,7 +279,7 @@ def optimise(
     points = qmc.Sobol(count, seed=seed).random(SCATTERED)
     scattered = START + SCATTER_SHARE * (points - START)
     design = Design(aim, base, simulate, limits)
-    design.start = -float(design.costs(START[:, None])[0])
+    design.start = -design.costs(START[:, None])[0]
 
     def generation(columns: ndarray) -> ndarray:
         costs = design.costs(columns)

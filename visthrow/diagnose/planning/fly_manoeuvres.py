@@ -18,9 +18,9 @@ from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import rotate, rotate_back, tilt_deg
 from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.models.numeric import command_of
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
-from visthrow.diagnose.models.thrust_map import command_of
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
@@ -128,7 +128,7 @@ def _throw_model(
     """Return the throw's model of a simulated flight, with the effects of another flight's."""
     log = flight.log(noise, model.has_voltage)
     carries = flight.manoeuvre.payload
-    releases = bool(np.any(flight.manoeuvre.release))
+    releases = np.any(flight.manoeuvre.release)
     setting = model.setting
     effects = effects_for(setting, set(log.channels), carries, releases)
     requested = {e.name for e in model.effects}
@@ -239,7 +239,7 @@ class SimulatedFlight:
         astray = np.max(distance) / ASTRAY
         swing = self.swing / HIGHEST
         used = np.max([swing, astray, sunk])  # NaN counts
-        return min(float(used), LOST) if np.isfinite(used) else LOST
+        return min(used, LOST) if np.isfinite(used) else LOST
 
     @property
     def swing(self) -> float:
@@ -380,8 +380,5 @@ def _stack(manoeuvres: Sequence[Manoeuvre], name: str) -> ndarray:
     """Return rows of manoeuvres side by side, each at its last one from its end on."""
     columns = [getattr(m, name) for m in manoeuvres]
     rows = np.arange(max(map(len, columns)))
-    held = []
-    for column in columns:
-        last = len(column) - 1
-        held.append(column[np.minimum(rows, last)])
+    held = [column[np.minimum(rows, len(column) - 1)] for column in columns]
     return np.stack(held, 1)

@@ -52,7 +52,7 @@ class Manoeuvre:
     @property
     def lowest(self) -> float:
         """Return the height at which a flight is aborted [m]."""
-        low = float(self.pos_w[:, 2].min())
+        low = self.pos_w[:, 2].min()
         return max(0.05, low - min(0.3, 0.5 * low))
 
     @property

@@ -185,7 +185,7 @@ def sections(
     listed = [
         _verdict(diagnosis, gain),
         _residuals(diagnosis),
-        _gain(gain, bool(diagnosis.theta)),
+        _gain(gain, diagnosis.theta),
         _candidates(diagnosis),
         _levels(diagnosis),
         _laws(diagnosis),
@@ -229,7 +229,7 @@ def _residuals(diagnosis: Diagnosis) -> Section:
     return section("residuals", "Residuals before and after", *drawn)
 
 
-def _gain(gain: Gain | None, named: bool) -> Section:
+def _gain(gain: Gain | None, named: Mapping[str, float]) -> Section:
     """Prediction errors; where nothing was named, only those of the model as it stands."""
     title = "Gain on flights that were not used"
     if gain is None:

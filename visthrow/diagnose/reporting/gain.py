@@ -5,7 +5,7 @@ answer predicts the one left out. Beside it stand the noise floor, which cannot 
 black box trained on the same flights."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray
@@ -46,10 +46,9 @@ class LandingGain:
     moved: dict[
         str, float
     ]  # named effect -> mean distance by which it moves the predicted landings
-    off_before: tuple[
-        tuple[float, float], ...
-    ] = ()  # of each throw, prediction less measurement along world x and y
-    off_after: tuple[tuple[float, float], ...] = ()
+    # of each throw, prediction less measurement along world x and y
+    off_before: tuple[tuple[float, float], ...]
+    off_after: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -58,15 +57,13 @@ class Gain:
 
     channels: tuple[ChannelGain, ...]
     nats_per_sample: float  # of held-out log-likelihood
-    named_in: dict[str, float] = field(
-        default_factory=dict
-    )  # effect -> share of folds that named it
-    folds: int = 0
-    left_out: str = "flights"  # or "parts of flights"
-    landing: LandingGain | None = None  # where the model has throws whose landing was seen
+    named_in: dict[str, float]  # effect -> share of folds that named it
+    folds: int
+    left_out: str  # "flights", or "parts of flights"
+    landing: LandingGain | None  # where the model has throws whose landing was seen
     # windows have no initial state that would have to be fitted first, and are predicted from end
     # to end
-    whole: bool = False
+    whole: bool
 
     def __getitem__(self, channel: str) -> ChannelGain:
         return next(c for c in self.channels if c.channel == channel)
@@ -84,7 +81,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     trained = {}
     if cross.left_out == "flights" and diagnosis.theta:
         for flight, sizes in zip(cross.statistics.flights, cross.trained):
-            trained[int(flight)] = work.problem.sizes(sizes)
+            trained[flight] = work.problem.sizes(sizes)
     landing = landing_gain(work, diagnosis.theta, trained, seed)
     whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
     nats = _nats(work, cross)
@@ -107,7 +104,7 @@ def landing_gain(
     named = model.landings(theta, flown) if theta else plain
     held_landings = named
     if trained:
-        parts = [model.landings(trained[int(f)], [int(f)]) for f in plain.flights]
+        parts = [model.landings(trained[f], [f]) for f in plain.flights]
         columns = zip(*(vars(part).values() for part in parts))
         held_landings = type(plain)(*map(np.concatenate, columns))
     good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)
@@ -125,7 +122,7 @@ def landing_gain(
         off.append(tuple(map(tuple, level.tolist())))
     after = mean(held_landings.errors[good], seed=seed)
     return LandingGain(
-        throws=int(good.sum()),
+        throws=good.sum(),
         held_out=bool(trained),
         before=plain.errors[good].mean(),
         after=after.value,
@@ -198,7 +195,7 @@ def _sum_weighted_squares(
     for plain, window in zip(correlated, mended):
         innovation, expected, horizon = predicted(window, noise, window.residual)
         weight = (plain.sigma / window.sigma) ** 2
-        outliers += int((weight < 1.0).sum())
+        outliers += (weight < 1.0).sum()
         squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2
         weighted = np.where(horizon >= 0, weight * squares, 0.0)
         added = np.array([np.bincount(window.channel, row, count) for row in weighted])

@@ -98,7 +98,7 @@ def random_shares(
         if not (named or all_effects):
             continue
         columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
-        deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
+        deviations = tuple(effect.prior_sd / priors.floor[columns])
         floors = effect.floor / effect.prior_sd
         for group, informative in groups.items():
             if columns and informative[:, columns].any(1).sum() > 1:
@@ -136,7 +136,7 @@ def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
     covered = {name for v in named for name in v.of}
     for e in effects:
         if e.name not in covered and not e.switch:
-            yield as_random(e), float(np.log(len(effects)))
+            yield as_random(e), np.log(len(effects))
 
 
 def as_random(effect: Effect) -> RandomEffect:
@@ -159,13 +159,13 @@ def _events(
     effects: Sequence[Effect], priors: Priors, flights: ndarray, flown: ndarray
 ) -> list[Candidate]:
     """Return each effect in each flight alone."""
-    penalty = float(np.log(max(flown.size, 1)))
+    penalty = np.log(max(flown.size, 1))
     offered = []
     for j, e in enumerate(effects):
         flights_with = flights[flown[:, j]].tolist()
         if not priors.visible[j] or e.switch or len(flights_with) < FEWEST:
             continue
-        deviation = (float(priors.slab[j]),)
+        deviation = (priors.slab[j],)
         for flight in flights_with:
             name = f"{e.name} in flight {flight}"
             offered.append(Candidate(name, (j,), EVENT, penalty, deviation, flight=flight))
@@ -331,7 +331,7 @@ def allowed(size: float) -> float:
     """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
     floors.
     """
-    return float(np.hypot(1.0, INEXACT * size))
+    return np.hypot(1.0, INEXACT * size)
 
 
 def between_flights(
@@ -356,7 +356,7 @@ def between_flights(
         nats.append(evidence_of(unlike, priors, active))
     value = np.array(nats) - max(nats)
     weight = REACH * np.exp(value - 0.5 * REACH**2)  # steps of u grow with u
-    variance = float(weight @ REACH**2 / weight.sum())
+    variance = weight @ REACH**2 / weight.sum()
     return variance * bool(active), (share**2).sum(0)
 
 

@@ -255,13 +255,10 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
     in either.
     """
     windows = [m.windows({}) for m in (model, rival)]
-    places = []
-    for of_model in windows:
-        number = {}
-        for i, window in enumerate(of_model):
-            if finite(window):
-                number[window.flight, window.time[0], len(window.time)] = i
-        places.append(number)
+    places = [
+        {(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(of_model) if finite(w)}
+        for of_model in windows
+    ]
     shared = sorted(places[0].keys() & places[1].keys())
     followed, rival_followed = (2 * len(n) >= len(of) for n, of in zip(places, windows))
     if not rival_followed or not shared:  # the other fails in most

@@ -54,7 +54,7 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
         earlier = before.noise.latent_sd.get(key, float("nan"))
         name = LATENT_BLOCKS[block]
         excessive = bool(nats > threshold)
-        listed.append(Level(name, phase, earlier, level, quiet, float(nats), excessive))
+        listed.append(Level(name, phase, earlier, level, quiet, nats, excessive))
     return tuple(listed)
 
 
@@ -75,7 +75,7 @@ def floors_of(point: Point) -> dict[tuple[int, str], float]:
     for gram, reach in zip(point.grams, reaches):
         for block, distance in reach.items():
             moves.setdefault((block, gram.phase), []).append(distance)
-    medians = {key: float(np.median(distances)) for key, distances in moves.items()}
+    medians = {key: np.median(distances) for key, distances in moves.items()}
     return {key: LANDING / median for key, median in medians.items() if median > 0.0}
 
 
@@ -90,7 +90,7 @@ def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, 
     reaches = {}
     for block in np.unique(gram.latent_block).tolist():
         of_block = square @ (gram.latent_block == block)
-        reaches[block] = float(np.sqrt(of_block.max()))
+        reaches[block] = np.sqrt(of_block.max())
     return reaches
 
 
@@ -110,7 +110,7 @@ def _in_phase(point: Point, phase: str) -> tuple[list[Gram], Noise]:
 def _likelihood(grams: Sequence[Gram], noise: Noise, key: tuple[int, str], level: float) -> float:
     """Return the log likelihood of a phase's residuals under a level of a block and phase."""
     tried = replace(noise, latent_sd={**noise.latent_sd, key: level})
-    return float(fitted(grams, tried)[1].sum())
+    return fitted(grams, tried)[1].sum()
 
 
 def _upper_limit(grams: Sequence[Gram], noise: Noise, key: tuple[int, str]) -> float:
@@ -120,7 +120,7 @@ def _upper_limit(grams: Sequence[Gram], noise: Noise, key: tuple[int, str]) -> f
     for step in range(1, MOST_STEPS):
         if _likelihood(grams, noise, key, best * STEP**step) < least:
             break
-    return float(best * STEP**step)
+    return best * STEP**step
 
 
 def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int] = ()) -> list[str]:
@@ -171,8 +171,8 @@ def too_strong(point: Point, share: float) -> tuple[str, ...]:
         thrust = window.knots.get("thrust", ())
         if len(thrust):
             of_phase = thrusts.setdefault(window.phase, [])
-            of_phase.append(float(np.median(np.abs(thrust))))
-    medians = [float(np.median(of_phase)) for of_phase in thrusts.values()]
+            of_phase.append(np.median(np.abs(thrust)))
+    medians = [np.median(of_phase) for of_phase in thrusts.values()]
     weight = max(medians, default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")
     strong = []

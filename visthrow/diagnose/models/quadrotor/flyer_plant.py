@@ -50,7 +50,7 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantPar
         "motor.kind": "instant",
         "queue.delay": 0.0,
         "rotors.inertia": 0.0,
-        "rotors.radius": float(np.sqrt(max(torque.inertia) / params.mass)),
+        "rotors.radius": np.sqrt(max(torque.inertia) / params.mass),
         "rotors.spin": torque.spin,
         "rotors.x": (x, x, -x, -x),
         "rotors.y": (y, -y, y, -y),

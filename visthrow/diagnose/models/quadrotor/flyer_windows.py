@@ -37,7 +37,7 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
     """
     weight = params.gravity * params.total_mass
     inputs = np.concatenate([s.data["sent"].values for s in stretches])
-    ratio = float(np.median(params.thrust(inputs).sum(axis=1))) / weight
+    ratio = np.median(params.thrust(inputs).sum(axis=1)) / weight
     if ratio > _MOST_THRUST:
         raise LogError(
             f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the"
@@ -71,10 +71,10 @@ def cut_flying(
         tables = [(*row, sd) for row, sd in zip(rows, sigma)]
         sent = cut_commands(commands, start - params.window, end + params.window)
         common: dict[str, Any] = {"start": start, "sent": sent, "volts": 0.0}
-        common["since"] = start - float(log[params.input].time[0])
+        common["since"] = start - log[params.input].time[0]
         if "battery_voltage" in log:
             middle = np.array([start + 0.5 * params.window])
-            common["volts"] = float(log["battery_voltage"].hold(middle)[0])
+            common["volts"] = log["battery_voltage"].hold(middle)[0]
         yield start, tables, common
 
 
@@ -130,7 +130,7 @@ def covered(channel: Channel, start: float, end: float) -> bool:
     during = (channel.time >= start) & (channel.time <= end)
     stamps = channel.time[channel.valid & during]
     gaps = np.diff([start, *stamps, end])
-    return len(stamps) > 5 and float(np.max(gaps)) < _MOST_MISSING
+    return len(stamps) > 5 and np.max(gaps) < _MOST_MISSING
 
 
 def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
@@ -147,8 +147,8 @@ def spare(row: float) -> int:
 def cut_commands(commands: Samples, first: float, last: float) -> Samples:
     """Return the commands that are held between two times, at least the first or the last."""
     time, values = commands
-    begin = max(int(np.searchsorted(time, first, "right")) - 1, 0)
-    end = max(int(np.searchsorted(time, last)), begin + 1)
+    begin = max(np.searchsorted(time, first, "right") - 1, 0)
+    end = max(np.searchsorted(time, last), begin + 1)
     return Samples(time[begin:end], values[begin:end])
 
 
@@ -235,7 +235,7 @@ def _guess(
     ``tables``: samples of each channel; ``quat, rate``: attitude and body rate at the start.
     """
     measured = tables[params.position]
-    start = float(measured[0][0])
+    start = measured[0][0]
     pos, vel = _line(measured, start)
     guess = [*pos, *vel]
     spread = [0.1] * 3 + [1.0] * 3
