@@ -101,22 +101,20 @@ def text(
         for key in effect.changes:
             words[key.path.removeprefix("plant.")].append(size)
     switched = [e.name for e in effects if e.switch]
-    lines = _head(base, provenance) + _add_comments(changed, words, switched)
-    return "\n".join(lines).rstrip() + "\n"
+    return _file(base, provenance, changed, words, switched)
 
 
-def _head(base: str, comments: Sequence[str]) -> list[str]:
-    """Return the first lines of a file on top of another."""
-    return [*(f"# {line}" for line in comments), dumps({"base": base}).strip(), ""]
-
-
-def _add_comments(
-    changed: Mapping[str, Any], words: Mapping[str, Sequence[str]], others: Sequence[str] = ()
-) -> list[str]:
-    """Return the lines of what changes with comments: words by the path of an entry, ``others`` on
-    what has none.
+def _file(
+    base: str,
+    comments: Sequence[str],
+    changed: Mapping[str, Any],
+    words: Mapping[str, Sequence[str]],
+    others: Sequence[str] = (),
+) -> str:
+    """Return a file on top of another: comments, and what changes with words by the path of an
+    entry, ``others`` on what has none.
     """
-    lines = []
+    lines = [*(f"# {line}" for line in comments), dumps({"base": base}).strip(), ""]
     section = ""
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
@@ -125,7 +123,7 @@ def _add_comments(
         if equals and not comment:
             comment = {"diagnosed": ["of the diagnosis above"], "laws": []}.get(section, others)
         lines.append(f"{line}  # {'; '.join(comment)}" if comment else line)
-    return lines
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def without_transient(
@@ -165,13 +163,13 @@ def with_firmware(
     changed = differences(
         dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller)
     )
-    lines = [
-        f"# Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()}"
+    comments = [
+        f"Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()}"
         f" in {Path(path).name}."
     ]
-    lines += [f"# Not in the block: {words}." for words in missing_features(settings)]
+    comments += [f"Not in the block: {words}." for words in missing_features(settings)]
     vehicle = {"controller": changed} | ({} if delay is None else {"queue": {"delay": delay}})
-    return "\n".join([*lines, dumps({"base": base, "vehicle": vehicle})])
+    return _file(base, comments, {"vehicle": vehicle}, {})
 
 
 def of_setup(
@@ -213,7 +211,7 @@ def of_setup(
         changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}
     for (name, size), sd in zip(theta.items(), np.sqrt(np.diag(covariance))):
         words[f"effects.{name}"] = [f"{size:+.4g} +- {sd:.2g} {effects[name].unit}"]
-    return "\n".join([*_head(base, comments), *_add_comments(changed, words)]) + "\n"
+    return _file(base, comments, changed, words)
 
 
 def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:

@@ -15,7 +15,7 @@ from numpy import ndarray
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.integrals import fitted
-from visthrow.diagnose.likelihood.marginal import Gram, Noise
+from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
@@ -38,19 +38,17 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     many, one is higher by chance."""
     noise = after.noise
     threshold = threshold + np.log(max(len(noise.latent_sd), 1))
-    parts = {phase: _in_phase(after, phase) for _, phase in noise.latent_sd}
-    limits = {key: _upper_limit(*parts[key[1]], key) for key in noise.latent_sd}
+    limits = {key: _upper_limit(after, key) for key in noise.latent_sd}
     floors = floors_of(after)
     listed = []
     for key in sorted(limits, key=lambda key: key[0]):
         block, phase = key
         level = noise.latent_sd[key]
-        part = parts[phase]
         quiet = min(limit for (b, _), limit in limits.items() if b == block)
         most = max(UNKNOWN_RATIO * quiet, floors.get(key, 0.0))
         nats = 0.0
         if level > most:
-            nats = _likelihood(*part, key, level) - _likelihood(*part, key, most)
+            nats = _likelihood(after, key, level) - _likelihood(after, key, most)
         earlier = before.noise.latent_sd.get(key, float("nan"))
         name = LATENT_BLOCKS[block]
         excessive = bool(nats > threshold)
@@ -100,25 +98,21 @@ def positions_of(point: Point) -> list[int]:
     return [c for c, name in enumerate(channels) if unit_of(name) == "m"]
 
 
-def _in_phase(point: Point, phase: str) -> tuple[list[Gram], Noise]:
-    """Return the windows of a phase, and the levels with the shares of these."""
-    windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-    noise = replace(point.noise, share=point.noise.share[windows])
-    return [point.grams[w] for w in windows], noise
-
-
-def _likelihood(grams: Sequence[Gram], noise: Noise, key: tuple[int, str], level: float) -> float:
+def _likelihood(point: Point, key: tuple[int, str], level: float) -> float:
     """Return the log likelihood of a phase's residuals under a level of a block and phase."""
-    tried = replace(noise, latent_sd={**noise.latent_sd, key: level})
-    return fitted(grams, tried)[1].sum()
+    windows = [w for w, gram in enumerate(point.grams) if gram.phase == key[1]]
+    noise = point.noise
+    levels_of = {**noise.latent_sd, key: level}
+    tried = replace(noise, latent_sd=levels_of, share=noise.share[windows])
+    return fitted([point.grams[w] for w in windows], tried)[1].sum()
 
 
-def _upper_limit(grams: Sequence[Gram], noise: Noise, key: tuple[int, str]) -> float:
+def _upper_limit(point: Point, key: tuple[int, str]) -> float:
     """Return the largest level of a block that a phase's residuals allow, one-sided 97.5 %."""
-    best = noise.latent_sd[key]
-    least = _likelihood(grams, noise, key, best) - 0.5 * NORMAL_95**2
+    best = point.noise.latent_sd[key]
+    least = _likelihood(point, key, best) - 0.5 * NORMAL_95**2
     for step in range(1, MOST_STEPS):
-        if _likelihood(grams, noise, key, best * STEP**step) < least:
+        if _likelihood(point, key, best * STEP**step) < least:
             break
     return best * STEP**step
 
