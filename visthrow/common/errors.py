@@ -17,14 +17,6 @@ class ConfigError(VisthrowError):
     """A configuration file, an override or a name of a configuration is wrong."""
 
 
-class UnknownKeyError(ConfigError):
-    """A configuration holds a key that its schema does not: ``key``, with dots."""
-
-    def __init__(self, message: str, key: str) -> None:
-        super().__init__(message)
-        self.key = key
-
-
 class PolicyError(VisthrowError):
     """A policy file cannot be read or does not describe a policy."""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Union
 
-from visthrow.common.errors import ConfigError, UnknownKeyError, suggest
+from visthrow.common.errors import ConfigError, suggest
 
 NONE_WORD = "none"  # TOML has no null: this string stands for None wherever a field is optional
 # names what lies under a file (another file) or under a table among like ones (a sibling)
@@ -145,8 +145,7 @@ def _build_dataclass(schema: type, node: Leaf | ConfigTable, path: str) -> Any:
     for key, item in node.items.items():
         if key not in types_of:
             place = _join(path, key)
-            message = f"{item.source}: {place}: unknown key; {suggest(key, types_of)}"
-            raise UnknownKeyError(message, place)
+            raise ConfigError(f"{item.source}: {place}: unknown key; {suggest(key, types_of)}")
     required = [
         f.name
         for f in dataclasses.fields(schema)

@@ -148,7 +148,9 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
         "nats": 40.0,
     }
     out = tmp_path / "law.toml"
-    command = f"diagnose apply {diagnosis(theta={}, covariance=[], laws=[law])} --out {out}"
+    command = (
+        f"diagnose apply {diagnosis(theta={}, covariance=[], explanations=[[law]])} --out {out}"
+    )
     assert "vertical_cross_vel" in printed(f"{command} --laws 1")
     assert load_experiment(out).laws == (
         LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
@@ -157,7 +159,7 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
         f"{command} --laws 2", message="asks for number 2 of its laws; expected a number up to 1"
     )
     assert "--laws 1 writes it" in printed(command)
-    path = diagnosis(theta={}, covariance=[], laws=[law | {"factors": ["sped"]}])
+    path = diagnosis(theta={}, covariance=[], explanations=[[law | {"factors": ["sped"]}]])
     command = f"diagnose apply {path} --out {tmp_path / 'other.toml'} --laws 1"
     refused(command, message="no factor 'sped'; did you mean 'speed'?")
 

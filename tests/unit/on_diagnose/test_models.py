@@ -517,12 +517,6 @@ class TestSetups:
         with raises(ConfigError, match="has no model"):
             setups.model_of(setups.Setup("bare"), [])
 
-    @mark.parametrize("table", setups.EXAMPLES)
-    def test_a_model_that_moved_says_where_it_is(self, table, tmp_path):
-        (tmp_path / "mine.toml").write_text(f'about = "mine"\n[{table}]\nwindow = 1.0\n')
-        with raises(ConfigError, match=rf"mine.toml: the model \[{table}\] .* examples/{table} "):
-            setups.load(tmp_path / "mine.toml")
-
     def test_a_mapping_without_a_model_names_its_program(self, refused):
         swing = DATA / "real" / "pendulum_single" / "single_pendulum_id.csv.gz"
         for command in ("explain", "fit"):

@@ -8,7 +8,7 @@ from pytest import fixture, mark, raises
 
 from visthrow import config
 from visthrow.common import toml_text
-from visthrow.common.errors import ConfigError, UnknownKeyError
+from visthrow.common.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,8 @@ def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, parts
 
 def test_an_unknown_key_is_known_beside_overrides_too(write):
     path = write("a.toml", GOOD.replace("gain", "gane"))
-    with raises(UnknownKeyError, match=r"with count=4") as caught:
+    with raises(ConfigError, match=r"inner.gane: unknown key.*with count=4"):
         config.load(Outer, path, ["count=4"])
-    assert caught.value.key == "inner.gane"
 
 
 def test_missing_file_names_its_neighbours(write):

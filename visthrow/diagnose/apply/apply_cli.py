@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if not theta and not laws:
         hint = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         what = "configuration" if of_throw else "setup"
-        law = hint if saved.report.get("laws") else ""
+        law = hint if saved.report.get("explanations") else ""
         print(f"nothing to write{law}; the {what} stands as it is")
         return 0
     if not args.anyway:

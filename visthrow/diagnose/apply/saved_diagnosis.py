@@ -86,12 +86,11 @@ class SavedDiagnosis:
 
     def explanation(self, rank: int) -> list[dict[str, Any]]:
         """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
-        report = self.report
-        explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
+        explanations = self.report.get("explanations") or []
         if rank > len(explanations):
             choices = f"expected a number up to {len(explanations)}"
             if not explanations:
-                reasons = "; ".join(report.get("reasons") or ["none"])
+                reasons = "; ".join(self.report.get("reasons") or ["none"])
                 choices = (
                     "it holds none: a formula is a law only where flights that are left out repeat"
                     f" its coefficient. Reasons of its verdict: {reasons}"

@@ -9,7 +9,7 @@ from typing import Any
 
 from sim.params import LawParams
 from visthrow import config
-from visthrow.common.errors import ConfigError, UnknownKeyError
+from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
@@ -29,9 +29,6 @@ MODELS: dict[str, Any] = {
     "imu": ImuModel,
 }
 """Table of a setup -> the model that it parametrises."""
-
-EXAMPLES = ("gimbal", "pendulum", "trim")
-"""Tables of earlier versions, whose models are programs under ``examples`` now."""
 
 
 @dataclass(frozen=True)
@@ -94,15 +91,7 @@ def load(name: str | Path | None) -> Setup:
     """
     if name is None:
         return Setup("")
-    try:
-        return config.load(Setup, config.find("diagnose", str(name)))
-    except UnknownKeyError as error:
-        if error.key not in EXAMPLES:
-            raise
-        raise ConfigError(
-            f"{name}: the model [{error.key}] is a program of the repository now; copy"
-            f" examples/{error.key} and change its numbers"
-        ) from None
+    return config.load(Setup, config.find("diagnose", str(name)))
 
 
 def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:

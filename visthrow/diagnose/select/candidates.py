@@ -91,7 +91,11 @@ def random_shares(
         all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
-    groups = _informative(flown, statistics.days)
+    groups = {FLIGHT: flown}  # which effects each shows
+    days = np.array(statistics.days)
+    by_day = [flown[days == day].any(0) for day in np.unique(days)]
+    if 1 < len(by_day) < len(flown):
+        groups[DAY] = np.array(by_day)
     offered = []
     for effect, penalty in _varying(effects):
         named = effect.name not in effect.of
@@ -113,18 +117,6 @@ def random_shares(
                 )
                 offered.append(candidate)
     return offered + _events(effects, priors, statistics.flights, flown)
-
-
-def _informative(flown: ndarray, days: Sequence[int]) -> dict[str, ndarray]:
-    """Return which flights, and which days if there are several, are informative on each effect.
-
-    ``flown``: of each flight, shape (F, K), bool; ``days``: of each flight, or none."""
-    groups = {FLIGHT: flown}
-    day_of = np.array(days)
-    by_day = [flown[day_of == day].any(0) for day in np.unique(day_of)]
-    if 1 < len(by_day) < len(flown):
-        groups[DAY] = np.array(by_day)
-    return groups
 
 
 def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
