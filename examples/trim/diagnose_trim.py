@@ -27,11 +27,7 @@ def main() -> None:
     logs = read_logs(args.logs, "crazypad")  # the mapping of columns
     if args.fit:
         fitted = fit(TrimModel(logs, UNTRIMMED), MOTORS)
-        for i, name in enumerate(fitted.names):
-            low, high = fitted.interval(i)
-            print(
-                f"{name}: thrust times {1.0 + fitted.theta[i]:.3f} [{1 + low:.3f}, {1 + high:.3f}]"
-            )
+        print("\n".join(fitted.sentences))  # the thrust of each is 1 + its size
         return
     model = TrimModel(logs, {"E8": E8, "E9": E9}[args.drone])
     print(summary(diagnose(logs, model)))

@@ -40,7 +40,7 @@ RUNS = {
     ),
     "trim/diagnose_trim": (
         f"{FAULTS}/cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz --fit",
-        "motor_rl: thrust times 0.6",
+        "motor_rl = -0.3",
     ),
 }
 """Program -> its arguments, and what it prints."""

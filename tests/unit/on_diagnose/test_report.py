@@ -309,7 +309,7 @@ def test_where_nothing_was_named_no_error_with_names_is_given(diagnosed, measure
     for theta in (diagnosed[1].theta, {}):
         (section,) = (
             s
-            for s in report.sections(replace(diagnosed[1], theta=theta, work=None), measured)
+            for s in report.sections(replace(diagnosed[1], theta=theta), measured)
             if s.title == "Gain on flights that were not used"
         )
         rows[bool(theta)] = section.parts[0].rows[0]

@@ -4,7 +4,7 @@ next diagnosis read.
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
+from visthrow.diagnose.inputs.fit import list_covariance
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import term_of
@@ -202,19 +203,13 @@ def of_setup(
     saved.refuse_strange(after, effects)
     changed: dict[str, Any] = {}
     words = {}
-    comments = [*provenance, *_rows_of(list(theta), covariance)]
+    comments = [*provenance, *list_covariance(list(theta), covariance)]
     if laws := saved.laws(rank):
         changed["laws"] = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
         rows = [x.get("covariance") or [x["sd"] ** 2] for x in saved.explanation(rank)]
-        comments += _rows_of([term_of(law).formula for law in laws], rows)
+        comments += list_covariance([term_of(law).formula for law in laws], rows)
     if theta:
         changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}
     for (name, size), sd in zip(theta.items(), np.sqrt(np.diag(covariance))):
         words[f"effects.{name}"] = [f"{size:+.4g} +- {sd:.2g} {effects[name].unit}"]
     return _file(base, comments, changed, words)
-
-
-def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:
-    """Return the comments that hold a covariance."""
-    rows = [f"  {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
-    return [f"covariance of {', '.join(names)}:", *rows] if names else []

@@ -5,9 +5,8 @@ Where a diagnosis asks which cause is there, a fit takes for granted that all ch
 slabs are the only prior."""
 
 import hashlib
-import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -56,10 +55,16 @@ class FitResult:
     rms_after: Mapping[str, float]
     middle_speed: float = 0.0  # of a stand's steps, to which its linear part refers [rad/s]
 
-    def interval(self, i: int) -> tuple[float, float]:
-        """95 % interval of one of them."""
-        half = 1.96 * np.sqrt(self.covariance[i, i])
-        return self.theta[i] - half, self.theta[i] + half
+    @property
+    def sentences(self) -> list[str]:
+        """Return the size of each effect with its 95 % interval."""
+        sentences = []
+        reach = 1.96 * np.sqrt(np.diag(self.covariance))
+        for i, (name, size) in enumerate(zip(self.names, self.theta)):
+            interval = f"95 % [{size - reach[i]:.6g}, {size + reach[i]:.6g}]"
+            note = "" if self.identified[i] else " (the prior: these logs do not determine it)"
+            sentences.append(f"{name} = {size:.6g} {self.units[i]}, {interval}{note}")
+        return sentences
 
 
 def fit(model: Model, free: Sequence[str]) -> FitResult:
@@ -194,18 +199,16 @@ def _head(name: str, result: FitResult, sources: Mapping[str, str]) -> str:
         f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance"
         " also in fit.json."
     ]
-    for i, (effect, unit) in enumerate(zip(result.names, result.units)):
-        low, high = result.interval(i)
-        note = "" if result.identified[i] else " (the prior: these logs do not tell)"
-        lines.append(
-            f"# {effect} = {result.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}"
-        )
-    rows = []
-    for row in result.covariance:
-        rows.append([float(f"{x:.4g}") for x in row])
-    lines.append(f"# covariance, row by row: {json.dumps(rows)}")
+    listed = [*result.sentences, *list_covariance(result.names, result.covariance)]
+    lines += [f"# {line}" for line in listed]
     lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]
     return "\n".join(lines) + "\n\n"
+
+
+def list_covariance(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:
+    """Return the comments that hold a covariance."""
+    rows = [f"  {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
+    return [f"covariance of {', '.join(names)}:", *rows] if names else []
 
 
 def _digest(log: FlightLog) -> str:

@@ -30,12 +30,7 @@ def run(args: argparse.Namespace) -> int:
         n for n in fitting.DEFAULT_FREE.get(setup.model, ()) if n in {e.name for e in model.effects}
     ]
     result = fitting.fit(model, free)
-    for i, name in enumerate(result.names):
-        low, high = result.interval(i)
-        note = "" if result.identified[i] else "   not determined by these logs"
-        print(
-            f"{name:<20} {result.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {result.units[i]}{note}"
-        )
+    print("\n".join(result.sentences))
     for channel, before in result.rms_before.items():
         print(f"residual of {channel}: {before:.4g} before, {result.rms_after[channel]:.4g} after")
     base = config.load(VehicleParams, config.find("vehicle", args.vehicle))

@@ -130,7 +130,7 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
             differs.append(f"{effect} by {size:+.3g}{unit_suffix(diagnosis[effect].unit)}")
     if differs:
         return f"flight {flight} differs from the others in {', '.join(differs)}"
-    if diagnosis.work is not None and flight in {w.flight for w in diagnosis.work.after.windows}:
+    if flight in {w.flight for w in diagnosis.work.after.windows}:
         return (
             f"something happened in flight {flight} that the rest of its phase does not show; there"
             " the flight weighs little"
@@ -218,7 +218,7 @@ def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
 def _residuals(diagnosis: Diagnosis) -> Section:
     work = diagnosis.work
     drawn = []
-    if work is not None and diagnosis.theta:
+    if diagnosis.theta:
         caption = "residuals before and after"
         if any(window.nuisance.size for window in work.after.windows):
             caption += ", with each window's initial state fitted"
@@ -306,8 +306,6 @@ def _laws(diagnosis: Diagnosis) -> Section:
 
 def _catalogue(diagnosis: Diagnosis) -> list[Section]:
     """The effects, and which of them look alike."""
-    if diagnosis.work is None:
-        return []
     rows = []
     for f in diagnosis.findings:
         sizes = (f"{f.estimate:.3g}" if f.estimate else "", f"{f.low:.3g}", f"{f.high:.3g}")
