@@ -117,7 +117,7 @@ class TestBall:
         assert before > 20.0 * noise
         assert 0.7 * noise < after < 1.3 * noise
         for stretch in others.stretches:
-            stretch.measured[10::60] += 0.3
+            stretch.residual[10::60] += 0.3
         tested = on_others(others, others, diagnosis.theta, diagnosis)
         assert tested.outliers >= sum(len(s.measured[10::60]) for s in others.stretches)
         assert tested.errors["payload_pos_w"][1] < 2.0 * noise

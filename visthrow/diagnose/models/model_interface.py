@@ -21,6 +21,10 @@ from sim.effects.effect import Effect
 from sim.params import LawParams
 
 
+def _none() -> ndarray:
+    return np.zeros(0, dtype=int)
+
+
 @dataclass(frozen=True)
 class Window:
     """Residuals of one stretch of a flight, about a linearisation point theta.
@@ -39,14 +43,10 @@ class Window:
     nuisance: ndarray  # X, shape (N, D)
     nuisance_sd: ndarray  # vague prior of b, about 0, shape (D,)
     latent: ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
-    latent_block: ndarray = field(
-        default_factory=lambda: np.zeros(0, dtype=int)
-    )  # index into LATENT_BLOCKS, shape (G,)
-    latent_axis: ndarray = field(
-        default_factory=lambda: np.zeros(0, dtype=int)
-    )  # 0, 1, 2 for x, y, z, shape (G,)
+    latent_block: ndarray = field(default_factory=_none)  # index into LATENT_BLOCKS, shape (G,)
+    latent_axis: ndarray = field(default_factory=_none)  # 0, 1, 2 for x, y, z, shape (G,)
     # of the knot [s], shape (G,): each block and axis has the same ones, in order
-    latent_time: ndarray = field(default_factory=lambda: np.zeros(0))
+    latent_time: ndarray = field(default_factory=_none)
     knots: Mapping[str, ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
     the catalogue: ``time``, ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N],

@@ -8,7 +8,7 @@ linearisation is about a path near the measured one."""
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,22 +35,17 @@ SETTLED = 1e-3
 MOST_LANES = 6000  # simulated in one batch
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stretch(Window):
     """A window before any simulation: its residual is what was measured, and it has no derivatives.
 
     All stretches of a model have the same D and G.
     """
 
-    start: ndarray = field(default_factory=lambda: np.zeros(0))
+    start: ndarray
     """First guess of what is not known at the start, shape (D,)."""
-    data: Mapping[str, Any] = field(default_factory=dict)
+    data: Mapping[str, Any]
     """What simulation and sensors read: inputs, stamps."""
-
-    @property
-    def measured(self) -> ndarray:
-        """Return the measurements, shape (N,)."""
-        return self.residual
 
 
 @dataclass(frozen=True)
@@ -362,7 +357,7 @@ class NumericModel(Model, ABC):
     def _off(self, size: ndarray, start: ndarray) -> list[ndarray]:
         """Return the residuals of all stretches from states at their starts, shape (N,) each."""
         measured = self._measured(self._lanes(size, start))
-        return [s.measured - only for s, (only,) in zip(self.stretches, measured)]
+        return [s.residual - only for s, (only,) in zip(self.stretches, measured)]
 
     def _settle(self, size: ndarray) -> list[ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
@@ -431,7 +426,7 @@ class NumericModel(Model, ABC):
         stretches = self.stretches
         count = len(columns)
         if not count:
-            return [np.zeros((len(s.measured), 0)) for s in stretches]
+            return [np.zeros((len(s.residual), 0)) for s in stretches]
         lanes = self._lanes(size)
         steps = np.broadcast_to(steps, (len(stretches), count))
         axes = np.eye(getattr(lanes, name).shape[1])[list(columns)]

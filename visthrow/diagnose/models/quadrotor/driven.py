@@ -31,8 +31,8 @@ class DrivenModel(NumericModel):
         """
         blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
         self.pushes = [(block, axis) for block in blocks for axis in range(3)]
-        super().__init__(logs, params)
         self.steps = round(params.window / params.step)
+        super().__init__(logs, params)
 
     @property
     def motors(self) -> int:

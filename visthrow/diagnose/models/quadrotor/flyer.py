@@ -17,18 +17,21 @@ from visthrow.common.rotations import multiply, normal_part, quat_of_vector, rot
 from visthrow.diagnose.models.law_terms import add_cable
 from visthrow.diagnose.models.numeric import Lanes, Stretch, triangles
 from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
-from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
+from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams
 from visthrow.diagnose.models.quadrotor.flyer_plant import replay_of
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
+    IDLE,
+    MOST_MISSING,
     NEIGHBOUR,
-    ROWS,
-    say_what_is_low,
-    spare,
-    windows_of,
+    cut_flying,
+    guess_start,
+    lean_of,
     without_each,
 )
 from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.samples import Samples
 
+ROWS = 2  # of commands and attitudes a step
 SWINGING = 3  # steps a row where a payload swings below
 NEVER = 1e9  # after a start, when the cable is let go [s]
 
@@ -46,17 +49,56 @@ class FlyerModel(DrivenModel):
         drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         self.inputs = (params.attitude, params.input, *drivers)
         self.needed = (params.position, params.attitude, params.input, *simulated)
-        super().__init__(logs, params)
         self.row = params.step / ROWS  # between commands of a flight [s]
+        # rows of attitudes before a window and behind it, for what may be late
+        self.spare = int(np.ceil(MOST_LATE / self.row)) + 1
+        super().__init__(logs, params)
         self.rows = ROWS * self.steps
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
-        """See the base class."""
-        return windows_of(self, log, number)
+        """See the base class; windows in which the vehicle flies."""
+        params = self.params
+        driving = [params.position, params.attitude, params.input]
+        if NEIGHBOUR in log:
+            driving.append(NEIGHBOUR)
+        margin = self.spare
+        rows = np.arange(-margin, ROWS * self.steps + 1 + margin)
+        stretches = []
+        for start, tables, common in cut_flying(log, params, self.channels, driving):
+            stamps, positions, _ = tables[0]
+            if len(stamps) < 5 or np.min(positions[:, 2]) < params.lowest:
+                continue
+            times = start + self.row * rows
+            quat = log[params.attitude].samples().attitudes(times)
+            rate = Samples(times, quat).rates(params.step).at(times)
+            lean = lean_of(log, params.attitude, params.estimator_rate, times)
+            by_name = dict(zip(self.channels, tables))
+            guess, spread, direction = guess_start(by_name, params, quat[margin], rate[margin])
+            data = common | {"turned": np.hstack((quat, rate, lean)), "direction": direction}
+            if NEIGHBOUR in log:
+                data[NEIGHBOUR] = log[NEIGHBOUR].samples().at(times[margin:])
+            span = start, start + params.window
+            stretches.append(self.lay_out(number, "flight", tables, span, data, guess, spread))
+        return stretches
 
     def without_windows(self, logs: Sequence[FlightLog]) -> str:
-        """See the base class."""
-        return say_what_is_low(logs, self.params)
+        """Say how high logs fly and how much of the weight their thrust carries, beside what
+        windows need.
+        """
+        params = self.params
+        heights = [np.max(log[params.position].samples().values[:, 2]) for log in logs]
+        weight = params.gravity * params.total_mass
+        shares = []
+        for log in logs:
+            sent = log[params.input].samples().values
+            thrusts = params.thrust(sent[:, :1] if params.input == "command" else sent)
+            shares.append(np.max(thrusts.sum(axis=1)) / weight)
+        return (
+            f": {params.position} rises to {max(heights):.3g} m, windows are above lowest ="
+            f" {params.lowest:g} m; the thrust by {params.input} and thrust_map carries up to"
+            f" {max(shares):.3g} of the weight, windows at least {IDLE:g}; no channel may have a"
+            f" gap of {MOST_MISSING:g} s"
+        )
 
     def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; samples in the order of the replay's sensors."""
@@ -173,8 +215,7 @@ class FlyerModel(DrivenModel):
         """Return the attitudes that lanes take, and how they turn, in each row of their flights,
         shape (B, rows, ...): measured ones without what is wrong with them.
         """
-        first = spare(self.row)
-        late = first + self.size_of(lanes, "attitude_delay") / self.row
+        late = self.spare + self.size_of(lanes, "attitude_delay") / self.row
         measured = self.of_windows(lanes, "turned")
         position = late[:, None] + np.arange(self.rows + 1)
         index = position.astype(int).clip(0, measured.shape[1] - 2)

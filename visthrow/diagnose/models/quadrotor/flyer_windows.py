@@ -11,8 +11,8 @@ from numpy import ndarray
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import cross, normal_part, rotate
-from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
-from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
+from visthrow.diagnose.models.numeric import Stretch, sigma_of, take_samples
+from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams, QuadrotorParams
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import Samples
 
@@ -21,13 +21,12 @@ LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
 Table = tuple[ndarray, ndarray, ndarray]
 """Stamps [s], shape (n,), values, shape (n, C), and their noise, shape (C,)."""
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
-ROWS = 2  # of commands and attitudes a step
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
-_MOST_MISSING = 0.25  # largest gap in an input within a window [s]
+MOST_MISSING = 0.25  # largest gap in an input within a window [s]
 # median thrust over the weight, by the map: a map may be far off, a unit is off by more
 _MOST_THRUST = 5.0
 _MEMORY = 10.0  # of a filter, in its time constants
-_IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
+IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
 def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None:
@@ -78,70 +77,18 @@ def cut_flying(
         yield start, tables, common
 
 
-def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch]:
-    """Cut a log, the flight of a number, into windows of a model that fly."""
-    params = model.params
-    driving = [params.position, params.attitude, params.input]
-    if NEIGHBOUR in log:
-        driving.append(NEIGHBOUR)
-    row = params.step / ROWS
-    margin = spare(row)
-    rows = np.arange(-margin, round(params.window / row) + 1 + margin)
-    stretches = []
-    for start, tables, common in cut_flying(log, params, model.channels, driving):
-        stamps, positions, _ = tables[0]
-        if len(stamps) < 5 or np.min(positions[:, 2]) < params.lowest:
-            continue
-        times = start + row * rows
-        quat = log[params.attitude].samples().attitudes(times)
-        rate = Samples(times, quat).rates(params.step).at(times)
-        lean = _lean(log, params.attitude, params.estimator_rate, times)
-        by_name = dict(zip(model.channels, tables))
-        guess, spread, direction = _guess(by_name, params, quat[margin], rate[margin])
-        data = common | {"turned": np.hstack((quat, rate, lean)), "direction": direction}
-        if NEIGHBOUR in log:
-            data[NEIGHBOUR] = log[NEIGHBOUR].samples().at(times[margin:])
-        span = start, start + params.window
-        stretches.append(model.lay_out(number, "flight", tables, span, data, guess, spread))
-    return stretches
-
-
-def say_what_is_low(logs: Sequence[FlightLog], params: FlyerParams) -> str:
-    """Say how high logs fly and how much of the weight their thrust carries, beside what windows
-    need.
-    """
-    heights = [np.max(log[params.position].samples().values[:, 2]) for log in logs]
-    weight = params.gravity * params.total_mass
-    shares = []
-    for log in logs:
-        sent = log[params.input].samples().values
-        thrusts = params.thrust(sent[:, :1] if params.input == "command" else sent)
-        shares.append(np.max(thrusts.sum(axis=1)) / weight)
-    return (
-        f": {params.position} rises to {max(heights):.3g} m, windows are above lowest ="
-        f" {params.lowest:g} m; the thrust by {params.input} and thrust_map carries up to"
-        f" {max(shares):.3g} of the weight, windows at least {_IDLE:g}; no channel may have a gap"
-        f" of {_MOST_MISSING:g} s"
-    )
-
-
 def covered(channel: Channel, start: float, end: float) -> bool:
     """Whether a channel has no large gap between two times."""
     during = (channel.time >= start) & (channel.time <= end)
     stamps = channel.time[channel.valid & during]
     gaps = np.diff([start, *stamps, end])
-    return len(stamps) > 5 and np.max(gaps) < _MOST_MISSING
+    return len(stamps) > 5 and np.max(gaps) < MOST_MISSING
 
 
 def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
     """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
     thrust = params.thrust(inputs).sum(axis=1)
-    return np.min(thrust) >= _IDLE * params.mass * params.gravity
-
-
-def spare(row: float) -> int:
-    """Rows of attitudes, so far apart [s], before a window and behind it, for what may be late."""
-    return int(np.ceil(MOST_LATE / row)) + 1
+    return np.min(thrust) >= IDLE * params.mass * params.gravity
 
 
 def cut_commands(commands: Samples, first: float, last: float) -> Samples:
@@ -190,7 +137,7 @@ def without_each(commands: Samples, params: FlyerParams, start: float) -> list[S
     return inputs
 
 
-def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
+def lean_of(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
     """Turn from a leaning estimate of the attitude to the true one, shape (T, 3); 0 where
     nothing tells it.
 
@@ -205,7 +152,7 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
     if force_b is None:
         return np.zeros((len(times), 3))
     time, force = force_b
-    share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
+    share = force[:, :2] / np.maximum(force[:, 2:], IDLE * GRAVITY)
     share = share - np.median(share, axis=0)
     recent = cut_commands(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
     tilt, _ = lagged(*recent, times[:, None], 1.0 / rate)
@@ -227,7 +174,7 @@ def _line(table: Table, start: float) -> ndarray:
     return np.polynomial.polynomial.polyfit(time[early] - start, values[early], 1)
 
 
-def _guess(
+def guess_start(
     tables: Mapping[str, Table], params: FlyerParams, quat: ndarray, rate: ndarray
 ) -> tuple[ndarray, ndarray, ndarray]:
     """Unknowns at the start, their spread, and the cable's direction there.
