@@ -167,11 +167,11 @@ def _suspect_deviation(
     together = np.concatenate([part.ravel() for part in parts])
     distant = noise.HUBER * noise.MAD_TO_SIGMA * np.median(np.abs(together))
     parts = [np.clip(part, -distant, distant) for part in parts]
-    square = sum(float((part**2).sum()) for part in parts)
-    neighbours = sum(float((part[1:] * part[:-1]).sum()) for part in parts)
+    square = sum((part**2).sum() for part in parts)
+    neighbours = sum((part[1:] * part[:-1]).sum() for part in parts)
     if neighbours <= SUSPECT * square:  # also where nothing is left
         return None
-    return float(np.sqrt(square / len(together)))
+    return np.sqrt(square / len(together))
 
 
 def _likeliest(
@@ -186,7 +186,7 @@ def _likeliest(
     Time and share trade off along a ridge. Of the guesses that are nearly as likely as the best,
     it is the one with the shortest time."""
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
-    period = float(np.median(np.concatenate(steps)))
+    period = np.median(np.concatenate(steps))
     white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
     if period > LONGEST:
         return white[0], 0.0
@@ -196,7 +196,7 @@ def _likeliest(
 
     def shortfall(place: ndarray, order: int) -> float:
         nonlocal levels
-        guess = Correlation(period * np.exp(place[0]), float(expit(place[1])), order, scale)
+        guess = Correlation(period * np.exp(place[0]), expit(place[1]), order, scale)
         value, levels = _likelihood(windows, channels, correlations_of, channel, guess, levels)
         tried.append((value, replace(guess, scale=scale * levels.scale[channel])))
         return -value

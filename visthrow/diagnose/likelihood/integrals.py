@@ -46,7 +46,7 @@ class _Shape:
     def square(self, gram: Gram) -> float:
         """Return r' V^-1 r + log det V of a window's residuals."""
         explained = np.square(self.projected(gram)).sum()
-        return float(self.weight @ gram.square - explained + self.log_det)
+        return self.weight @ gram.square - explained + self.log_det
 
 
 def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]:

@@ -77,7 +77,7 @@ class Gram:
         latents = slice(self.nuisances, self.hidden)
         squares = np.diagonal(self.inner, axis1=1, axis2=2).sum(0)[latents]
         return {
-            block: float(np.median(squares[self.latent_block == block]))
+            block: np.median(squares[self.latent_block == block])
             for block in np.unique(self.latent_block).tolist()
         }
 
@@ -104,7 +104,7 @@ class Noise:
         """
         square = self.share**2
         nats = np.log(square) + 1.0 / square - 1.0
-        return float(-0.5 * TAIL * nats.sum())
+        return -0.5 * TAIL * nats.sum()
 
 
 @dataclass(frozen=True)
@@ -191,9 +191,9 @@ def gram_of(window: Window, floors: ndarray, channels: int) -> Gram:
     count = np.bincount(window.channel, minlength=channels).astype(float)
     blocks = np.asarray(window.latent_block, dtype=int)
     states = window.nuisance.shape[1]
-    log_sigma = float(np.log(window.sigma).sum())
+    log_sigma = np.log(window.sigma).sum()
     for rows, factor in window.correlated:
-        log_sigma += rows.shape[1] * float(np.log(np.diag(factor)).sum())
+        log_sigma += rows.shape[1] * np.log(np.diag(factor)).sum()
     return Gram(
         window.flight,
         window.phase,
@@ -233,7 +233,7 @@ def in_one_channel(gram: Gram, scale: ndarray) -> Gram:
         inner=np.tensordot(weight, gram.inner, 1)[None],
         cross=(weight @ gram.cross)[None],
         square=np.array([weight @ gram.square]),
-        log_sigma=gram.log_sigma + float(gram.count @ np.log(scale)),
+        log_sigma=gram.log_sigma + gram.count @ np.log(scale),
     )
 
 

@@ -138,7 +138,7 @@ def _guess(grams: Sequence[Gram]) -> Noise:
             if information > 0.0:  # else these forces show nowhere in the window
                 levels = visible.setdefault((block, gram.phase), [])
                 levels.append(1.0 / np.sqrt(information))
-    medians = {key: float(np.median(levels)) for key, levels in visible.items()}
+    medians = {key: np.median(levels) for key, levels in visible.items()}
     share = np.ones((len(grams), len(LATENT_BLOCKS)))
     return Noise(scale, medians, CORRELATION_TIMES[0], share)
 
@@ -266,7 +266,7 @@ def _scoring_step(
     part.flat[:: len(part) + 1] += 1e-6
     right = slope[free] / size
     step[free] = np.linalg.solve(part, right) / size
-    promised = float(slope @ step)
+    promised = slope @ step
     turned = _logarithms(step)
     whole = step[layout.shares] + step[layout.phases]
     turned[layout.shares] = _logarithms(whole) - turned[layout.phases]
@@ -297,7 +297,7 @@ def _likelihood(
     slope[layout.shares] += TAIL * (inverse - 1.0)
     diagonal = np.einsum("ii->i", curvature)  # a view
     diagonal[layout.shares] += 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
-    return noise.log_prior + float(values.sum()), slope, curvature
+    return noise.log_prior + values.sum(), slope, curvature
 
 
 def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[Window]:

@@ -122,7 +122,7 @@ def landing_gain(
         off.append(tuple(map(tuple, level.tolist())))
     after = mean(held_landings.errors[good], seed=seed)
     return LandingGain(
-        throws=good.sum(),
+        throws=int(good.sum()),
         held_out=bool(trained),
         before=plain.errors[good].mean(),
         after=after.value,

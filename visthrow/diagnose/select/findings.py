@@ -67,11 +67,11 @@ class Reading:
         homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
         mean, sd = point.posterior.averaged(j, homes)
-        deviation = float(np.hypot(sd, MODEL_ERROR_FLOOR)) * effect.floor
+        deviation = np.hypot(sd, MODEL_ERROR_FLOOR) * effect.floor
         nats = point.evidence([*remaining, j]) - point.evidence(remaining)
         finding = replace(blank(effect), sd=deviation, nats=nats)
         if j in self.active or partners:
-            differs = float(np.sqrt(self.unlike) * allowed(mean)) * effect.floor
+            differs = np.sqrt(self.unlike) * allowed(mean) * effect.floor
             named = replace(finding, differs=differs)
             return self._named(named, mean, sorted({j, *partners}))
         size = mean * effect.floor
@@ -138,7 +138,7 @@ class Reading:
         with_one = 0.0
         without = 0.0
         for effects, nats in self.all_sets:
-            weight = float(np.exp(-nats))
+            weight = np.exp(-nats)
             if {*members}.isdisjoint(effects):
                 without += weight
             else:
@@ -150,7 +150,7 @@ class Reading:
         ``members`` are those of its class.
         """
         bounds = finding.low, finding.high
-        size = float(np.clip(mean * finding.floor, *bounds)) + 0.0  # no -0
+        size = np.clip(mean * finding.floor, *bounds) + 0.0  # no -0
         reach = NORMAL_95 * finding.sd
         low = max(bounds[0], size - reach) + 0.0
         high = min(bounds[1], size + reach) + 0.0
@@ -202,9 +202,9 @@ class Reading:
         best = vectors[:, -1]
         value = values[-1]
         score = precision @ (sigma @ posterior.score)
-        mean = float(best @ (slab * score) / value)
+        mean = best @ (slab * score) / value
         coefficients = best / slab / problem.priors.floor[members]
-        first = int(np.argmax(np.abs(best)))
+        first = np.argmax(np.abs(best))
         scale = coefficients[first]
         unit = effects[first].unit
         text = effects[first].name

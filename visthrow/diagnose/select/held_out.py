@@ -168,14 +168,14 @@ def borne_out(
     total = promised.sum()
     if total <= 0.0:
         return 0.0, np.nan, np.nan
-    value = float(brought.sum() / total)
+    value = brought.sum() / total
     n = count_telling(promised)
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
     scatter = np.sqrt(n / (n - 1.0) * square) / total
     chance = NORMAL_95 * np.sqrt(2.0 / total)
-    reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
+    reach = max(stdtrit(n - 1, 0.975) * scatter, chance)
     return value, value - reach, value + reach
 
 
@@ -242,7 +242,7 @@ def jackknifed(before: ndarray, after: ndarray) -> tuple[float, float, float]:
             without = np.log((new - after) / (old - before))
         variance = (n - 1.0) / n * ((without - without.mean()) ** 2).sum()
         reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt(variance)
-    return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
+    return tuple(1.0 - np.exp(0.5 * value + side) for side in (0.0, reach, -reach))
 
 
 def measure(diagnosis: Diagnosis) -> HeldOut:
@@ -516,13 +516,13 @@ def _kind(work: Work, channel: int) -> str:
         square = np.where(horizon < 0, 0.0, innovation**2)[rows]
         if components(window, channel) is not None and len(square) % 3 == 0:
             by_axis += square.reshape(-1, 3).sum(0)
-        by_flight[window.flight] += float(square.sum())
+        by_flight[window.flight] += square.sum()
         of_flight = times[window.flight]
         middle = 0.5 * (min(of_flight) + max(of_flight))
         halves[bool(window.time.mean() > middle)] += square.tolist()
     parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
-        parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
+        parts.append(f"mostly along {'xyz'[by_axis.argmax()]}")
     if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * sum(by_flight.values()):
         parts.append(f"mostly in flight {max(by_flight, key=by_flight.get)}")
     first, second = (np.sqrt(np.sum(half) / max(len(half), 1)) for half in halves.values())

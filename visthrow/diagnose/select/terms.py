@@ -269,10 +269,10 @@ def best_curves(
         if screened is None:
             continue
         gain, _ = survey.gains(screened, UNKNOWN_RATIO * force)
-        best = int(np.argmax(gain))
+        best = np.argmax(gain)
         scalar, vector = screened.terms[best].parts
         formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
-        curves[block] = float(gain[best] - np.log(len(gain))), formula
+        curves[block] = gain[best] - np.log(len(gain)), formula
     return curves
 
 
@@ -335,7 +335,7 @@ def shortlist(
     price = {}
     for depth in set(depths):
         simpler = sum(d <= depth for d in depths)
-        price[depth] = float(np.log(simpler))
+        price[depth] = np.log(simpler)
     present = {e.term for e in problem.terms}
     ranked: list[tuple[float, Term, float]] = []
     for block, screened in screens.items():
@@ -345,9 +345,9 @@ def shortlist(
         _, first = np.unique(np.round(gain, 3), return_index=True)
         for i in first:
             term = screened.terms[i]
-            nats = float(gain[i]) - price[term.depth]
+            nats = gain[i] - price[term.depth]
             if nats > threshold and term not in present:
-                ranked.append((nats, term, float(prior[i])))
+                ranked.append((nats, term, prior[i]))
     best = sorted(ranked, key=lambda f: -f[0])[:WEIGHED]
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
@@ -408,7 +408,7 @@ def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     found = []
     for j, size, row, variance in zip(columns, mean[columns] * floor, spread, spread.diagonal()):
         term = effects[j].term
-        sd = float(np.sqrt(variance))
-        head = term.block, term.factors, term.vector, float(size), term.formula
-        found.append(Law(*head, sd, term.unit, float(nats), tuple(row.tolist())))
+        sd = np.sqrt(variance)
+        head = term.block, term.factors, term.vector, size, term.formula
+        found.append(Law(*head, sd, term.unit, nats, tuple(row.tolist())))
     return tuple(found)

@@ -87,7 +87,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     shared_point = _about_means(replace(point, shares=shares), active, means)
     sized = tuple(sorted(varying | {*active}))
     sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
-    in_units = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
+    in_units = {problem.effects[j].name: sizes[j] * problem.priors.floor[j] for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
     reading = Reading(shared_point, active, withdrawn, sets, _all_sets(selection), unlike)
@@ -300,7 +300,7 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
             repeated.append(terms.laws(best.point, columns_of(chosen), value[chosen]))
         elif chosen == best.chosen:  # none in place of a better one
             by_flight = best.point.plain.information[:, columns, columns].sum(axis=1)
-            flight = best.point.plain.flights[int(np.argmax(by_flight))]
+            flight = best.point.plain.flights[np.argmax(by_flight)]
             return [], (
                 "a formula, which is not printed, explains these flights, but those that are left"
                 f" out do not repeat it: {share_text(share, low, high)}; flight {flight} shows it"
@@ -341,7 +341,7 @@ def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
     shares *= point.problem.priors.floor
     row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
     events = [c for c in chosen if c.group == EVENT]
-    return {c.name: float(shares[row[c.flight], c.columns[0]]) for c in events}
+    return {c.name: shares[row[c.flight], c.columns[0]] for c in events}
 
 
 def _events(selection: Selector, point: Point) -> tuple[int, ...]:

@@ -132,10 +132,10 @@ def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
         flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
-    start = float(time[flies][0])
-    end = float(time[flies][-1])
+    start = time[flies][0]
+    end = time[flies][-1]
     rows = (time >= start) & (time <= end)
-    hover = float(np.median(share[rows]))
+    hover = np.median(share[rows])
     if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
         return hover, 1.0, start, end
     acc = log["acc_b"].samples()
@@ -146,7 +146,7 @@ def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
     slope, level = np.polyfit(commanded, force, 1)
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
         return hover, 1.0, start, end
-    return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
+    return hover * (1.0 + (1.0 - level - slope) / slope), slope, start, end
 
 
 def _relate_rates(log: FlightLog) -> relations.Relation | None:
@@ -183,7 +183,7 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     """Degrees for radians, or radians for degrees, in the commanded rates."""
-    gain = float(np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0]))
+    gain = np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0])
     words = {
         1.0: "",
         np.pi / 180.0: "degrees a second",
@@ -205,8 +205,8 @@ def _thrust_unit(
     that it carries [N].
     """
     commands = [c for log in logs if (c := measured(log, "command")) is not None]
-    medians = [float(np.median(c.values[:, 0])) for c in commands]
-    ratio = float(np.median(medians)) / weight if medians else 0.0
+    medians = [np.median(c.values[:, 0]) for c in commands]
+    ratio = np.median(medians) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:
         return None
     unit = min(units, key=lambda unit: abs(np.log(ratio * units[unit])))

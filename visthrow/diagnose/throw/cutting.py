@@ -119,7 +119,7 @@ def _variation(flight: RecordedFlight, c: Cut, whole: ndarray) -> float:
     """Variance of a window's commands, against that of the whole flight's."""
     acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
     variance = np.var(flight.command[acts], axis=0)
-    return float(np.sum(variance / np.maximum(whole, TINY)))
+    return np.sum(variance / np.maximum(whole, TINY))
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:

@@ -193,7 +193,7 @@ def _reach(camera) -> ndarray:
     from camera.fisheye import Fisheye
 
     lens = camera.fisheye
-    return np.array([lens.fx, lens.fy]) * float(Fisheye(lens).edge_radius)
+    return np.array([lens.fx, lens.fy]) * Fisheye(lens).edge_radius
 
 
 def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> dict | None:
@@ -250,7 +250,7 @@ def _noise(points: ndarray, visible: ndarray) -> float:
         track = points[visible[:, k, i], k, i]
         if len(track) > 3:
             sigmas.append(highpass_sigma(track))
-    return float(np.median(sigmas)) if sigmas else 0.0
+    return np.median(sigmas) if sigmas else 0.0
 
 
 def _visible_keypoints(view: dict, setting: Setting, nominal: Setting, time: ndarray) -> ndarray:

@@ -265,7 +265,7 @@ def _hang(
     mount = state["pos_w"][0] + attitude.apply(arm)
     mount_vel = state["vel_w"][0] + attitude.apply(cross(state["rate_b"][0], arm))
     reach = point - mount
-    distance = max(float(np.linalg.norm(reach)), 1e-3)
+    distance = max(np.linalg.norm(reach), 1e-3)
     n = state["cable_dir_w"][0]
     u = state["cable_vel_w"][0]
     link = np.full((len(n), 1), plant.rope.length / len(n))
@@ -287,12 +287,12 @@ def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
     battery = v.battery
     rope = plant.rope
     L = rope.segments
-    thrust = max(float(flight.command[0, 0]), 0.05)
+    thrust = max(flight.command[0, 0], 0.05)
     power = _power(v, thrust)
     used = _charge(flight, v, power)
     volts = battery.reference_voltage
     if battery.kind == "sag":
-        open_volts = float(np.polynomial.polynomial.polyval(used, battery.ocv))
+        open_volts = np.polynomial.polynomial.polyval(used, battery.ocv)
         square = open_volts**2 - 4.0 * battery.resistance * power
         volts = 0.5 * (open_volts + np.sqrt(max(square, 0.0)))
     state = still(1, L)
@@ -309,9 +309,7 @@ def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
 def _power(v: VehicleParams, thrust: float) -> float:
     """Power drawn from the battery under a steady collective thrust [N]: [W]."""
     speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
-    return float(
-        v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
-    )
+    return v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
 
 
 def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
@@ -329,4 +327,4 @@ def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
         return 0.2 if cell.kind == "sag" else 0.0
     grid = np.linspace(0.0, 1.0, 201)
     open_volts = volts + cell.resistance * power / volts
-    return float(np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid))
+    return np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid)

@@ -85,7 +85,7 @@ def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndar
     late = falls[(falls > time[0]) & (falls < TRACK)]
     if not len(late):
         return None
-    first = float(late.min())
+    first = late.min()
     return down + first, np.polynomial.polynomial.polyval(first, fit)
 
 
@@ -156,7 +156,7 @@ def _fly(
     measured = onward.fly(model.simulation(setting), states, lanes).samples
     points = []
     for i, c in enumerate(flown):
-        first = 2 * int(onward.windows["vehicle_count"][i])
+        first = 2 * onward.windows["vehicle_count"][i]
         time = onward.samples[i][2].time
         path = measured[first : first + len(time), i]
         free = time > looked[c.flight].latch + release.lag

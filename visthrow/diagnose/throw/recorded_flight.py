@@ -105,7 +105,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     sigma = np.median(noise)
     if name == "quat_wb":
         sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0)
-    return ChannelSamples(time, values, max(float(sigma), LEAST_SIGMA[name]))
+    return ChannelSamples(time, values, max(sigma, LEAST_SIGMA[name]))
 
 
 def _thin(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
@@ -242,7 +242,7 @@ def _latch(log: FlightLog) -> float:
     if commands is None:
         return NEVER
     time, values = commands
-    return float(min(time[values[:, 0] > 0.5], default=NEVER))
+    return min(time[values[:, 0] > 0.5], default=NEVER)
 
 
 def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
@@ -250,7 +250,7 @@ def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
     landing = measured(log, "landing")
     if landing is None:
         return NEVER, None
-    return float(landing.time[0]), landing.values[0]
+    return landing.time[0], landing.values[0]
 
 
 def _voltage(log: FlightLog) -> float | None:
@@ -261,7 +261,7 @@ def _voltage(log: FlightLog) -> float | None:
     if voltage is None:
         return None
     time, volts = voltage
-    return float(np.median(volts[time < time[0] + AT_START]))
+    return np.median(volts[time < time[0] + AT_START])
 
 
 def _payload(log: FlightLog, landing: float) -> ChannelSamples | None:
