@@ -119,7 +119,7 @@ class TestBall:
         for stretch in others.stretches:
             stretch.residual[10::60] += 0.3
         tested = on_others(others, others, diagnosis.theta, diagnosis)
-        assert tested.outliers >= sum(len(s.measured[10::60]) for s in others.stretches)
+        assert tested.outliers >= sum(len(s.residual[10::60]) for s in others.stretches)
         assert tested.errors["payload_pos_w"][1] < 2.0 * noise
 
     def test_nothing_that_falls(self):

@@ -156,7 +156,7 @@ def _fly(
     measured = onward.fly(model.simulation(setting), states, lanes).samples
     points = []
     for i, c in enumerate(flown):
-        first = 2 * onward.windows["vehicle_count"][i]
+        first = 2 * int(onward.windows["vehicle_count"][i])
         time = onward.samples[i][2].time
         path = measured[first : first + len(time), i]
         free = time > looked[c.flight].latch + release.lag
