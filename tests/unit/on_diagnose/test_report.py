@@ -85,9 +85,7 @@ def measured(diagnosed):
 
 def test_flights_without_a_measured_landing_have_no_gain_in_landings(diagnosed, monkeypatch):
     model, diagnosis = diagnosed
-    points = np.empty((0, 3))
-    nothing = PredictedLandings(np.empty(0, int), points, points, points)
-    monkeypatch.setattr(model, "landings", lambda theta, flights: nothing)
+    monkeypatch.setattr(model, "landings", lambda theta, flights: None)
     assert gain.measure(diagnosis).landing is None
 
 

@@ -134,10 +134,9 @@ def without_transient(
 
     Returns the other sizes, their covariance, and the names that were left out.
     """
-    transient = [name for name in theta if catalogue()[name].transient]
-    sizes = {name: size for name, size in theta.items() if name not in transient}
+    sizes = {name: size for name, size in theta.items() if not catalogue()[name].transient}
     rows = [i for i, name in enumerate(theta) if name in sizes]
-    return sizes, covariance[np.ix_(rows, rows)], transient
+    return sizes, covariance[np.ix_(rows, rows)], [name for name in theta if name not in sizes]
 
 
 def with_firmware(

@@ -149,7 +149,7 @@ class Model(Protocol):
     def landings(
         self, theta: Mapping[str, float], flights: Sequence[int] | None = None
     ) -> Any | None:
-        """Return predicted and measured landings (``PredictedLandings``); None where the model has
-        no throws.
+        """Return predicted and measured landings (``PredictedLandings``); None where no throw's
+        landing was measured.
         """
         return None

@@ -99,7 +99,7 @@ def landing_gain(
     model = work.problem.model
     flown = sorted({w.flight for w in work.after.windows})
     plain = model.landings({}, flown)
-    if plain is None or len(plain.flights) == 0:
+    if plain is None:
         return None
     named = model.landings(theta, flown) if theta else plain
     held_landings = named

@@ -84,23 +84,15 @@ def diagnose(
     missing = len(flights) - len(left_out) - diagnosis.flights
     if missing > 0:
         notes.insert(0, f"{missing} of {len(flights)} flights have no window in this answer")
-    notes += _thrust_warnings(checked)
+    for log in checked:
+        warnings = [row for row in log.rows if (row.topic, row.verdict) == ("thrust", "warn")]
+        notes += [f"check: {log.name}: {row.text}" for row in warnings]
     notes += [
         f"check, overruled or of a channel that the model does not read: {text}" for text in unread
     ]
     if (why := model.lawless) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
-
-
-def _thrust_warnings(checked: Sequence[Checked]) -> list[str]:
-    """Return what the checks warn of about the thrust of each log."""
-    warnings = []
-    for log in checked:
-        for row in log.rows:
-            if (row.topic, row.verdict) == ("thrust", "warn"):
-                warnings.append(f"check: {log.name}: {row.text}")
-    return warnings
 
 
 def refused_of(

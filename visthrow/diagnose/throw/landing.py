@@ -91,12 +91,12 @@ def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndar
 
 def landings(
     model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None
-) -> PredictedLandings:
+) -> PredictedLandings | None:
     """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel`
     with effects at ``theta``.
 
     ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of
-    flights to look at; default all."""
+    flights to look at; default all. None where no landing was measured."""
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights
     before, separating, ends, points = {}, {}, {}, {}
@@ -109,7 +109,7 @@ def landings(
         ends[n] = landing[0] + AFTERWARDS
         points[n] = landing[1]
     if not points:
-        return PredictedLandings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
+        return None
     predicted, released = (_fly(model, theta, spans, ends) for spans in (before, separating))
     measured = np.array(list(points.values()))
     return PredictedLandings(np.array(list(points)), measured, predicted, released)

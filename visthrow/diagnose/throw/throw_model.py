@@ -316,7 +316,7 @@ class ThrowModel(Model):
 
     def landings(
         self, theta: Mapping[str, float], flights: Sequence[int] | None = None
-    ) -> PredictedLandings:
+    ) -> PredictedLandings | None:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
