@@ -5,7 +5,7 @@ Each manoeuvre is simulated with the model as found; its expected information, o
 measurement on the ground, is added to that at hand. For two members of a class the promise is the
 expected gap of their evidence with either as the truth, the smaller of both."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
-from visthrow.diagnose.likelihood.evidence import FEWEST, STRONG, Posterior, Priors
+from visthrow.diagnose.likelihood.evidence import FEWEST, STRONG, Posterior
 from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
@@ -82,10 +82,32 @@ class PlanningGoal:
         self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
     def information(self, model: Model) -> ndarray:
-        """Expected information of one simulated flight."""
-        return expected_information(
-            model, self.diagnosis.theta, self.base.noise, self.names, self.priors
+        """Return the expected information of one simulated flight about the diagnosis' effects, in
+        its floors, shape (K, K); 0 for what it hides.
+        """
+        theta = self.diagnosis.theta
+        noise = self.base.noise
+        flown = {e.name: i for i, e in enumerate(model.effects)}
+        windows = model.windows({name: size for name, size in theta.items() if name in flown})
+        floors = np.array([e.floor for e in model.effects])
+        channels = len(model.channels)
+        grams = grams_of(windows, floors, channels)
+        grams = correlated_of(grams, windows, noise.correlation_time)
+        expected = replace(
+            noise,
+            scale=np.ones(channels),
+            latent_sd=_expect_levels(noise, {w.phase for w in windows}),
+            share=np.ones((len(windows), len(LATENT_BLOCKS))),
         )
+        flown_theta = np.zeros(len(floors))
+        information = Integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
+        # both catalogues name the same effects, each in floors of its own
+        places = np.zeros((len(self.names), len(floors)))
+        for i, name in enumerate(self.names):
+            if name in flown:
+                j = flown[name]
+                places[i, j] = self.priors.floor[i] / floors[j]
+        return places @ information @ places.T
 
     def nats(self, new: ndarray) -> float:
         """Expected nats between the members of the pair that is hardest, or the mean logarithm by
@@ -175,9 +197,7 @@ class PlanningGoal:
     def proposal(self, flight: Manoeuvre | Measurement, new: ndarray) -> FlightProposal:
         """Return the promise of a manoeuvre, or of a measurement, of this information."""
         separated, repeats = self.settled(new)
-        separates = []
-        for group in separated:
-            separates.append(tuple(self.names[j] for j in group))
+        separates = [tuple(self.names[j] for j in group) for group in separated]
         return FlightProposal(
             flight.name,
             flight.purpose,
@@ -235,32 +255,3 @@ def _expect_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], floa
         usual = loudest.get(block, default)
         levels[block, phase] = noise.latent_sd.get((block, phase), usual)
     return levels
-
-
-def expected_information(
-    model: Model, theta: Mapping[str, float], noise: Noise, names: Sequence[str], priors: Priors
-) -> ndarray:
-    """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0
-    for what they hide.
-    """
-    flown = {e.name: i for i, e in enumerate(model.effects)}
-    windows = model.windows({name: value for name, value in theta.items() if name in flown})
-    floors = np.array([e.floor for e in model.effects])
-    channels = len(model.channels)
-    grams = grams_of(windows, floors, channels)
-    grams = correlated_of(grams, windows, noise.correlation_time)
-    expected = replace(
-        noise,
-        scale=np.ones(channels),
-        latent_sd=_expect_levels(noise, {w.phase for w in windows}),
-        share=np.ones((len(windows), len(LATENT_BLOCKS))),
-    )
-    flown_theta = np.zeros(len(floors))
-    information = Integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
-    # both catalogues name the same effects, each in floors of its own
-    places = np.zeros((len(names), len(floors)))
-    for i, name in enumerate(names):
-        if name in flown:
-            j = flown[name]
-            places[i, j] = priors.floor[i] / floors[j]
-    return places @ information @ places.T

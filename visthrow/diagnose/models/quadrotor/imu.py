@@ -4,7 +4,7 @@ accelerometer and gyro.
 Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
 of torque to inertia. An accelerometer's offset hides the map's scale."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,12 +89,7 @@ class ImuModel(DrivenModel):
         pushes = self.pushes_at(lanes, halves(self.steps))
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
         if "rate_b" in self.channels:
-            turning = self._turning(lanes, thrust)
-
-            def slope(half: int, rate: ndarray) -> ndarray:
-                return turning(half, rate, pushes[half, :, -3:])
-
-            rates = integrate(slope, lanes.nuisance[:, :3], self.steps, self.params.step)
+            rates = self._turn(lanes, thrust, pushes[:, :, -3:])
         gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
@@ -111,9 +106,9 @@ class ImuModel(DrivenModel):
             measured.append(np.array([on_grid(grid, lane, time).ravel() for lane in states]))
         return np.concatenate(measured, axis=1)
 
-    def _turning(self, lanes: Lanes, thrust: ndarray) -> Callable:
-        """Return what gives the angular acceleration from the motors' thrusts and the offset of the
-        centre of mass, by the half step, rates and a torque [N m].
+    def _turn(self, lanes: Lanes, thrust: ndarray, push: ndarray) -> ndarray:
+        """Return the body rates under the motors' thrusts, the offset of the centre of mass and
+        further torques at the half steps [N m], shape (B, T, 3).
         """
         p = self.params.torque
         scale = 1.0 + self.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
@@ -121,12 +116,12 @@ class ImuModel(DrivenModel):
         com_x, com_y = self.stack(lanes, "com_x", "com_y").T
         total = thrust.sum(2)
         lever = np.stack([-com_y * total, com_x * total, 0.0 * total], -1)
-        torque = p.of(thrust) + lever
+        torque = p.of(thrust) + lever + push
 
-        def turning(half: int, rate: ndarray, push: ndarray) -> ndarray:
-            return (torque[half] - cross(rate, inertia * rate) + push) / inertia
+        def slope(half: int, rate: ndarray) -> ndarray:
+            return (torque[half] - cross(rate, inertia * rate)) / inertia
 
-        return turning
+        return integrate(slope, lanes.nuisance[:, :3], self.steps, self.params.step)
 
 
 def _relate_turning(log: FlightLog, params: ImuParams) -> Relation | None:
