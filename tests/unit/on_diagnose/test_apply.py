@@ -214,7 +214,7 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
     ("changes", "message"),
     [
         ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "no effects of the throw"),
-        ({"covariance": [[1.0]]}, "expected one each"),
+        ({"covariance": [[1.0]]}, "expected 25"),
         ({"theta": None}, "no diagnosis"),
         (
             {"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}},

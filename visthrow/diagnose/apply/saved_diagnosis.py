@@ -48,17 +48,17 @@ class SavedDiagnosis:
         Raises DiagnoseError: something is missing."""
         try:
             theta = {str(name): float(size) for name, size in self.report["theta"].items()}
-            covariance = [[float(x) for x in row] for row in self.report["covariance"]]
+            covariance = np.array(self.report["covariance"], dtype=float)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             reason = f"it has no {error}" if isinstance(error, KeyError) else error
             raise DiagnoseError(
                 f"{self.path}: no diagnosis that `visthrow diagnose explain` wrote: {reason}"
             ) from error
         count = len(theta)
-        if len(covariance) != count or any(len(row) != count for row in covariance):
+        if covariance.size != count**2:
             raise DiagnoseError(
-                f"{self.path}: {count} effects and a covariance of {len(covariance)} rows; expected"
-                " one each"
+                f"{self.path}: {count} effects and a covariance of {covariance.size} numbers;"
+                f" expected {count**2}"
             )
         variance = dict.fromkeys(theta, 0.0)
         for row in self.report.get("scatter") or []:
