@@ -345,7 +345,7 @@ def test_the_recording_is_written(tmp_path, diagnosed):
         ("blind nothing.npz", "nothing.npz"),
         ("plan nothing.npz", "nothing.npz"),
         ("explain nothing.npz --config nobody", "nobody"),
-        ("map .", "a folder, expected a file"),
+        ("map .", "a folder without flight.npz"),
         ("plan nothing.npz --hall nan,5,3", "--hall nan,5,3: expected three lengths"),
         ("plan nothing.npz --hall 5,5,0.5", "a height above 0.8 m"),
         ("plan nothing.npz --manoeuvres hoover", "did you mean 'hover'"),

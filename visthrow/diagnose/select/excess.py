@@ -164,13 +164,9 @@ def too_strong(point: Point, share: float) -> tuple[str, ...]:
     for window in point.windows:
         thrust = window.knots.get("thrust", ())
         if len(thrust):
-            of_phase = thrusts.setdefault(window.phase, [])
-            of_phase.append(np.median(np.abs(thrust)))
+            thrusts.setdefault(window.phase, []).append(np.median(np.abs(thrust)))
     medians = [np.median(of_phase) for of_phase in thrusts.values()]
     weight = max(medians, default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")
-    strong = []
-    for (b, phase), level in point.noise.latent_sd.items():
-        if b == block and level > share * weight:
-            strong.append(phase)
-    return tuple(strong)
+    levels_of = point.noise.latent_sd.items()
+    return tuple(phase for (b, phase), level in levels_of if b == block and level > share * weight)
