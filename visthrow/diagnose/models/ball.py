@@ -66,9 +66,9 @@ class BallModel(NumericModel):
             pos = path[rows]
             fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
             vel_x, vel_y, _ = fit[1]
-            across = np.array([-vel_y, vel_x, 0.0])
-            across /= max(np.linalg.norm(across), 1e-6)
-            data = {"time": time, "across": across, "span": np.ptp(time)}
+            sideways = np.array([-vel_y, vel_x, 0.0])
+            sideways /= max(np.linalg.norm(sideways), 1e-6)
+            data = {"time": time, "across": sideways, "span": np.ptp(time)}
             begin = [*fit[0], *fit[1]], [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
             table = time, pos, sigma
             span = time[0], time[-1]

@@ -88,10 +88,10 @@ class Limits:
         if self.hold(path + added):
             return 1.0
 
-        def beyond(share: float) -> float:
+        def excess(share: float) -> float:
             return np.max(_extremes(path + share * added) - self._most) - 0.5 * ROUNDING
 
-        return brentq(beyond, 0.0, 1.0)
+        return brentq(excess, 0.0, 1.0)
 
     def around(self, path: ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""

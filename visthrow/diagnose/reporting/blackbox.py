@@ -84,17 +84,17 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
 
 @dataclass(frozen=True)
 class Trained:
-    """What groups of windows say of the table's W weights."""
+    """Information of groups of windows on the table's W weights."""
 
     statistics: Statistics  # of the effects, and behind them of the weights
     reach: ndarray  # prior deviation of each weight at reach 1, shape (W,)
 
     def weights(self, keep: ndarray) -> ndarray:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
-        known = self.statistics.only(keep)
-        behind = slice(-len(self.reach), None)
-        information = known.information.sum(0)[behind, behind]
-        score = known.score.sum(0)[behind]
+        chosen = self.statistics.only(keep)
+        of_weights = slice(-len(self.reach), None)
+        information = chosen.information.sum(0)[of_weights, of_weights]
+        score = chosen.score.sum(0)[of_weights]
         mean = np.zeros(len(self.reach))
         likeliest = -np.inf
         for reach in REACHES:
