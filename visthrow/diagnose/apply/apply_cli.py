@@ -67,10 +67,11 @@ def run(args: argparse.Namespace) -> int:
     )
     atomic_write(args.out, content)
     config.load(schema, Path(args.out))  # as training, or the next diagnosis, will read it
-    named = list(theta)
-    for law in laws:
-        named.append(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})")
-    print(f"{args.out}: {', '.join(named)} on top of {base}")
+    of_laws = [
+        f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})"
+        for law in laws
+    ]
+    print(f"{args.out}: {', '.join([*theta, *of_laws])} on top of {base}")
     return 0
 
 

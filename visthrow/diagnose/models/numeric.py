@@ -90,11 +90,10 @@ class NumericModel(Model, ABC):
                 f" model explains{self.without_windows(full)}"
             )
         driving = set(self.inputs) - set(self.channels)
-        effects = []
-        for effect in self.catalogue():
-            shown_by = tuple(c for c in effect.channels if c not in driving)
-            effects.append(replace(effect, channels=shown_by))
-        self.effects = tuple(effects)
+        self.effects = tuple(
+            replace(effect, channels=tuple(c for c in effect.channels if c not in driving))
+            for effect in self.catalogue()
+        )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
         self._slopes: list[ndarray] = []  # by the unknowns at the start
@@ -113,13 +112,13 @@ class NumericModel(Model, ABC):
 
         Raises LogError: all lack one.
         """
-        present = [[name for name in self.needed if log.samples(name, 1)] for log in logs]
-        usable = [i for i, names in enumerate(present) if len(names) == len(self.needed)]
+        lacking = [[name for name in self.needed if not log.samples(name, 1)] for log in logs]
+        usable = [i for i, names in enumerate(lacking) if not names]
         if not usable:
-            lacking = sorted(set(self.needed).difference(*present))
+            missing = sorted(set(self.needed).intersection(*lacking))
             raise LogError(
                 f"no log has all of {', '.join(self.needed)}; missing everywhere:"
-                f" {', '.join(lacking) or 'none'}"
+                f" {', '.join(missing) or 'none'}"
             )
         return [stretch for i in usable for stretch in self.windows_of(logs[i], i)]
 

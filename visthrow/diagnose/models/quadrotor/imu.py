@@ -4,7 +4,7 @@ accelerometer and gyro.
 Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
 of torque to inertia. An accelerometer's offset hides the map's scale."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -76,10 +76,6 @@ class ImuModel(DrivenModel):
             span = start, start + p.window
             stretches.append(self.lay_out(number, "flight", tables, span, data, *begin))
         return stretches
-
-    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
-        """See the base class; none."""
-        return [{} for _ in paths]
 
     def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; the state: body rates, and behind them the force along the rotors'
