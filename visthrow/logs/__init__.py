@@ -46,6 +46,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         return _read_folder(path, mapping)
     if not path.exists():
         return _read_named(path, mapping)
+    _refuse_pointer(path)
     if ending == ".npz":
         log = FlightLog.load(path)
         log.meta.setdefault("source", str(path))
@@ -110,6 +111,14 @@ def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
             )
         return chosen
     raise _missing(path)
+
+
+def _refuse_pointer(path: Path) -> None:
+    """Raise LogError: in a file's place stands a pointer of Git LFS."""
+    if path.is_file():
+        with path.open("rb") as file:
+            if file.read(23) == b"version https://git-lfs":
+                raise LogError(f"{path}: a pointer of Git LFS; `git lfs pull` fetches the log")
 
 
 def _missing(path: Path) -> LogError:
@@ -191,6 +200,7 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
                 " `explain` join logs, and a folder of tables is one recording"
             )
         raise _missing(path)
+    _refuse_pointer(path)
     if path.name.lower().endswith(TABLES):
         return table_to_log.read_table(path)
     if bag or ending in recordings.READERS or recordings.is_card(path):

@@ -221,6 +221,13 @@ def test_rows_that_share_a_stamp_have_a_clock():
     assert propose(table, "a.csv").why["time"].endswith("100 Hz")
 
 
+def test_a_counter_in_a_table_without_a_header_is_no_place():
+    time = 0.01 * np.arange(500)
+    columns = 1e6 * time, np.arange(500.0), np.sin(time), np.cos(time), 1.0 + np.sin(2.0 * time)
+    table = {f"column {i}": cells for i, cells in enumerate(columns, start=1)}
+    assert propose(table, "a.log").mapping.entry("pos_w").columns[0] == "column 3"
+
+
 def test_an_unknown_number_becomes_a_question(tmp_path):
     columns = flight(20.0)
     proposal = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")

@@ -59,7 +59,7 @@ def matlab(path: Path) -> None:
         {
             "time": TIME,
             "drone": {"pos": COLUMNS["pos_w"]},
-            "imu": {"acc": COLUMNS["acc_b"]},
+            "imu": np.array([{"acc": COLUMNS["acc_b"]}, {"count": TIME}], dtype=object),
             "note": "a flight",
         },
     )
@@ -164,6 +164,7 @@ def folder(path: Path) -> None:
     """A table for each topic, whose names begin alike, and a file that is no table."""
     path.mkdir()
     (path / "run3_notes.txt").write_text("none")
+    (path / "run3_events.csv").write_text("number,kind\n" + "".join(f"{i},1\n" for i in range(99)))
     for topic, name in (("pose", "pos_w"), ("imu", "acc_b")):
         rows = np.column_stack([1e9 * TIME, COLUMNS[name]])
         head = f"stamp,{name}.x,{name}.y,{name}.z"
@@ -186,6 +187,7 @@ def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     assert (proposal.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), (
         "tables with clocks of their own"
     )
+    assert not any("events:" in question for question in proposal.questions)
     with raises(LogError, match="needs a mapping"):
         read(path)
 

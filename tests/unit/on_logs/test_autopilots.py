@@ -68,15 +68,7 @@ def ardupilot(tmp_path):
     return log
 
 
-@mark.parametrize(
-    ("change", "channel", "word"),
-    [
-        ({"flags": (0, 1, 0, 1)}, "pos_w", "xy_valid"),
-        ({"flags": (1, 0, 1, 1)}, "pos_w", "z_valid"),
-        ({"flags": (1, 1, 1, 0)}, "vel_w", "v_z_valid"),
-        ({"eph": 40.0}, "pos_w", "eph"),
-    ],
-)
+@mark.parametrize(("change", "channel", "word"), VEHICLES["invalid"])
 def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, px4):
     log = px4(**change)
     valid = log[channel].valid

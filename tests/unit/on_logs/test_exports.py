@@ -242,7 +242,7 @@ def test_angles_in_degrees_are_no_position(proposed):
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
     _, proposal, _ = proposed(table_with(",".join(names), angles, POS))
-    (entry,) = (entry for entry in proposal.mapping.channels if entry.name == "pos_w")
+    entry = proposal.mapping.entry("pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
     assert "quad.Rotation.X [deg]" in proposal.left_out
 
@@ -281,5 +281,5 @@ def test_rotor_speeds_are_proposed_as_speeds(proposed):
     heads = {"rpm1,rpm2,rpm3,rpm4": "rpm", "m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]": "rad/s"}
     for head, unit in heads.items():
         _, proposal, _ = proposed(table_with(f"x,y,z,{head}", POS, speeds))
-        (entry,) = [e for e in proposal.mapping.channels if e.name == "motor_speed"]
+        entry = proposal.mapping.entry("motor_speed")
         assert entry.unit == unit

@@ -332,16 +332,7 @@ class TestTables:
         with raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
             export(log, tmp_path / "f.xlsx")
 
-    @mark.parametrize(
-        ("rows", "message"),
-        [
-            (["t,v", "0,1", "1,2,3", "2,2"], "line 3 has 3 cells"),
-            (["t,v"], "no rows"),
-            ([""], "no header"),
-            (["t,w", "0,1"], "no column 'v'"),
-            (["t,v", "0,fast"], "holds text such as 'fast'"),
-        ],
-    )
+    @mark.parametrize(("rows", "message"), FORMS["bad_tables"])
     def test_bad_tables(self, tmp_path, rows, message):
         with raises(LogError, match=message):
             read_rows(tmp_path, rows, PLACE)
@@ -353,25 +344,16 @@ class TestTables:
             read(tmp_path / "b.csv")
         with raises(LogError, match=r"ending '\.doc'"):
             read(written(tmp_path, ["t,v\0"], "a.doc"))
+        with raises(LogError, match="JSON"):
+            read(written(tmp_path, ['{"t": 1,', '"x": 2}']))
+        for name in "a.csv", "a.bin":
+            with raises(LogError, match="a pointer of Git LFS"):
+                read(written(tmp_path, ["version https://git-lfs.github.com/spec/v1"], name))
         (tmp_path / "run").mkdir()
         with raises(LogError, match="a folder without"):
             read(tmp_path / "run")
 
-    @mark.parametrize(
-        ("change", "message"),
-        [
-            ({"unit": "parsec"}, "unit 'parsec'"),
-            ({"unit": "deg"}, "is of the kind 'rad'"),
-            ({"name": "quat_wb", "unit": "deg"}, "expected kind, one of quaternion, euler"),
-            ({"columns": ()}, "no columns"),
-            ({"axes": "x,y"}, "expected x, y and z once each"),
-            ({"axes": "x,y,-z"}, "mirror the world"),
-            ({"axes": "x,x,z"}, "expected x, y and z once each"),
-            ({"kind": "quaternion"}, "quaternion of 3 columns"),
-            ({"kind": "quat"}, "kind 'quat'; known: euler"),
-            ({"order": "zyxw"}, "order 'zyxw'; "),
-        ],
-    )
+    @mark.parametrize(("change", "message"), FORMS["bad_mappings"])
     def test_bad_mappings(self, change, message):
         with raises(ConfigError, match=message):
             ChannelMap(**({"name": "pos_w", "columns": ("x", "y", "z"), "unit": "m"} | change))

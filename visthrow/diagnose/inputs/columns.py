@@ -121,9 +121,21 @@ def moves(values: ndarray) -> bool:
     return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
 
 
+def rises(cells: ndarray) -> bool:
+    """Tell whether a column rises as a clock does."""
+    steps = np.diff(cells[np.isfinite(cells)])
+    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and np.mean(steps > 0.0) > 0.3
+
+
 def _neighbours(numbers: Table) -> list[list[str]]:
-    """Group the columns of a table without a header: four of length 1, and threes of the others."""
-    names = list(numbers)
+    """Group the columns of a table without a header: four of length 1, and threes of the others but
+    counters.
+    """
+    names = [
+        name
+        for name, cells in numbers.items()
+        if not (rises(cells) and np.array_equal(cells, np.round(cells)))
+    ]
     groups: list[list[str]] = []
     run: list[str] = []
     while names and all(name.startswith("column ") for name in names):

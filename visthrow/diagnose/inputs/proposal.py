@@ -13,8 +13,15 @@ import numpy as np
 from numpy import ndarray
 
 from visthrow.common.errors import LogError
-from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, moves, unit_by_name
-from visthrow.diagnose.inputs.recognition import Recognition, rises
+from visthrow.diagnose.inputs.columns import (
+    NAMES,
+    PATTERNS,
+    groups_of,
+    moves,
+    rises,
+    unit_by_name,
+)
+from visthrow.diagnose.inputs.recognition import Recognition
 from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, by_mass
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
@@ -106,9 +113,11 @@ def _mapping(
     """Map the columns of numbers, and say why and ask in a proposal; None without a channel."""
     channels = {}
     clocks = {}
+    unread: list[str] = []  # questions about tables of which nothing is read
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
+        asked = len(proposal.questions)
         clock, time = _clock(part, proposal, time_unit)
         columns = {
             name: cells
@@ -116,17 +125,23 @@ def _mapping(
             if name != clock.column and len(cells) == len(time)
         }
         recognition = Recognition(time, groups_of(columns), settings)
+        rivals = []
         for entry in recognition.channels():
             if entry.name in channels:
                 listed = ", ".join(entry.columns)
-                proposal.questions.append(f"'{entry.name}' is also {listed}: which one?")
+                rivals.append(f"'{entry.name}' is also {listed}: which one?")
                 continue
             clocks[topic] = clock
             first = topic == next(iter(clocks))
             channels[entry.name] = replace(entry, clock="" if first else topic)
             proposal.why[entry.name] = recognition.why[entry.name]
         proposal.questions += recognition.questions
+        if topic not in clocks:  # nothing of this table is read
+            unread += proposal.questions[asked:]
+            del proposal.questions[asked:]
+        proposal.questions += rivals
     if not channels:
+        proposal.questions += unread
         return None
     main, *further = clocks
     others = {name: clocks[name] for name in further} or None

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.common.rotations import matrix_of_quat, rotate_back, tilt_deg
-from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, moves, split_unit
+from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, moves, rises, split_unit
 from visthrow.diagnose.inputs.unit_evidence import (
     LENGTHS,
     SURE,
@@ -69,12 +69,6 @@ class Path:
         if self.group.matches("estimate"):
             return "est_pos_w"
         return "mocap_pos_w" if self.group.matches("capture") else "pos_w"
-
-
-def rises(cells: ndarray) -> bool:
-    """Tell whether a column rises as a clock does."""
-    steps = np.diff(cells[np.isfinite(cells)])
-    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and np.mean(steps > 0.0) > 0.3
 
 
 class Recognition:

@@ -195,6 +195,8 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
             table |= _flat(
                 {field: values[field] for field in values.dtype.names}, f"{prefix}{name}."
             )
+        elif values.dtype.kind == "O" and values.size <= WIDEST:  # a cell, or several structs
+            table |= _flat({f"{name}[{i}]": _open(x) for i, x in enumerate(values.flat)}, prefix)
         elif values.dtype.kind in "biuf":
             values = values.squeeze()
             values = values.T if values.ndim == 2 and values.shape[0] < values.shape[1] else values
@@ -206,6 +208,12 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
                     for i, column in enumerate(values.T)
                 }
     return table
+
+
+def _open(item: Any) -> Any:
+    """Return the fields of a MATLAB struct that stands in a cell; anything else as it is."""
+    fields = getattr(item, "_fieldnames", None)
+    return item if fields is None else {name: getattr(item, name) for name in fields}
 
 
 def _bag(path: Path) -> Table:

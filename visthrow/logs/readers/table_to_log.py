@@ -95,7 +95,10 @@ def _layout_of_file(path: Path) -> TextTable:
     packed = _OPENERS.get(path.suffix)
     try:
         data = unpack(path, packed, LogError) if packed else path.read_bytes()
-        layout = layout_of(data.decode("utf-8-sig"), str(path))
+        text = data.decode("utf-8-sig")
+        if text.lstrip().startswith("{"):
+            raise LogError(f"{path}: JSON; expected a table, a line for each instant")
+        layout = layout_of(text, str(path))
     except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
         raise LogError(
             f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
