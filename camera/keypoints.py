@@ -101,7 +101,7 @@ def goal_square(side: float) -> Tensor:
 
 
 def goal_corners_w(goal_w: Array, square_w: Array) -> Array:
-    """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
+    """Corners of the ground square around the goal, on z = 0 for any height of the goal.
 
     Args:
         goal_w: Goal [m], shape (E, 2) or (E, 3), world frame.

@@ -122,7 +122,8 @@ class KeypointNoiseParams(BoundedFields):
     wrong_probability: Share = 0.0  # per step and keypoint that something else is taken for it [-]
     held_probability: Share = 0.0  # per step that the last image's keypoints come again [-]
     scale_std: NotNegative = 0.0  # Gaussian per episode: relative error of the focal length [-]
-    # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
+    # radius of the image beyond which nothing is visible: a narrower lens, read by its own
+    # calibration [-]
     visible_radius: Annotated[float, Bound(0.0, 1.0, "(]")] = 1.0
     invalid_reads: Literal["edge", "zero"] = "edge"
 

@@ -73,7 +73,7 @@ def capture_graph(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGr
 
 class ReplayedGraph:
     """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and
-    replayed, on a stream of its own.
+    replayed, on a separate stream.
     """
 
     def __init__(self, work: Callable[[], None]):

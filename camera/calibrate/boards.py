@@ -22,7 +22,7 @@ WRONG_BOARD = 5.0
 """Residual of a board over the median of all, above which its corners are another's."""
 
 VIEW_AT_LEAST = 6
-"""Points of a partly seen board below which its pose is not determined well."""
+"""Points of a partly visible board below which its pose is not determined well."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         board: The board.
 
     Returns:
-        Its points, row by row; of a ChArUco board those that are seen. None where no whole board
-        (of a ChArUco board: fewer than six points) is found.
+        Its points, row by row; of a ChArUco board the detected ones. None where no whole board (of
+        a ChArUco board: fewer than six points) is found.
     """
     import cv2
 
@@ -350,7 +350,7 @@ def reproject(lens: Fisheye, view: View) -> ndarray:
 
 
 def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:
-    """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector,
+    """Reprojected less detected pixels [px], shape (2 N,), of a board at a pose (rotation vector,
     place).
     """
     import cv2

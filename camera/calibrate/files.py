@@ -184,7 +184,7 @@ def _tree_of_xml(text: str) -> Any:
 
 
 def _cameras_of(path: str | Path) -> list[Entry]:
-    """Cameras of a file, each by a name of its own or its number."""
+    """Cameras of a file, by their names or numbers."""
     cameras = list(_cameras(_tree(path)))
     names = [name for *_, name in cameras]
     named = []

@@ -62,7 +62,7 @@ class DetectorParams(BoundedFields):
     field_share: Positive = (
         0.84  # side of the goal's coloured field over that of the square with its rim [-]
     )
-    coverage: Share = 0.35  # share of the ball's outline that must be seen
+    coverage: Share = 0.35  # share of the ball's outline that must be visible
     misfit: Positive = 0.1  # largest RMS of the outline from its cone, in half-angles
     side_tolerance: Positive = (
         0.3  # of the goal's sides from what they must be where height and attitude are known [-]
@@ -167,8 +167,8 @@ class Detector:
             )
 
     def _ball(self, mask: ndarray, level: ndarray, prior: Prior) -> BallSeen | None:
-        """The blob whose edge is the best cone; where none is, what stands out by its colour from
-        where the ball is expected.
+        """The blob whose edge is the best cone; without one, the region at the ball's expected
+        position that stands out by its colour.
         """
         best = self._best_cone(circles_of(mask), level, prior)
         if best is None and prior.ball_ray_c is not None:
@@ -192,9 +192,7 @@ class Detector:
         return best
 
     def _find_expected_ball(self, level: ndarray, prior: Prior) -> BallSeen | None:
-        """A ball on a ground or beside a thing that has its colour too, about where it
-        is expected.
-        """
+        """A ball in front of a ground or an object of its colour, near its expected position."""
         import cv2
 
         ray_c = np.ascontiguousarray(prior.ball_ray_c, np.float64)
@@ -301,7 +299,7 @@ def order_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
 def convert_to_training_keypoints(
     camera: KeypointCamera, detections: FrameDetections, rot_wb: ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Keypoints of the training camera from what was seen, by the functions that training calls.
+    """Keypoints of the training camera from detections, by the functions that training calls.
 
     The ball's cone gives its distance, its true radius being known, and from there on the box is
     training's own, with the bias that training's has: extremes are exact to second order in the
@@ -315,7 +313,7 @@ def convert_to_training_keypoints(
 
     Returns:
         Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where
-        nothing was seen.
+        nothing was detected.
     """
     points = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, 2)
     valid = torch.zeros(GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS, dtype=torch.bool)

@@ -19,7 +19,7 @@ READ = 0.01
 there, and of the detection [rad].
 """
 
-TURNS = 4.0  # rate of a ball that was seen once, about each axis [rad/s]
+TURNS = 4.0  # rate of a ball that was detected once, about each axis [rad/s]
 
 DRIVEN = 8.0
 """Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2].
@@ -42,9 +42,9 @@ as much in a frame of a throw, and of the frames of training one in twenty is re
 """
 
 MEMORY = 2.0
-"""Time in which what a frame said of a square fades to 1/e, and after which one that was not seen
-again is forgotten [s]: a hover. A frame counts by the time since the one before, as frames err
-alike the closer they are.
+"""Time in which a frame's evidence of a square fades to 1/e, and after which an undetected one is
+forgotten [s]: a hover. A frame counts by the time since the one before, as frames err alike the
+closer they are.
 """
 
 SUREST = 0.99  # probability of a square in one frame at most

@@ -34,9 +34,9 @@ class Effect(BoundedFields):
     # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise;
     # the diagnosis of throws says by how much a size moves landings
     floor: Positive
-    channels: tuple[str, ...]  # channels of the log without which it cannot be seen
+    channels: tuple[str, ...]  # channels of the log that it needs
     source: str  # of equation and prior
-    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from effects that look alike
+    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from similar effects
     # group of effects that differ from each other by less than their equations are exact
     alike: str = ""
     # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says
@@ -130,7 +130,7 @@ class SettingEffect(Effect):
     changes: tuple[Change, ...] = ()
     step: Positive = 0.25  # of theta for derivatives, in floors
     needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
-    # a switch to a simpler block: left out unless asked for, as each compiles a kernel
+    # a switch to a simpler block: only on request, as each compiles a kernel
     simpler: bool = False
     # whether it is a state of these flights only, which no configuration of the vehicle takes over
     transient: bool = False

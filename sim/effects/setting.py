@@ -27,7 +27,7 @@ class Setting:
 
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)
-    # of the integration step against the one asked for: errors grow with it
+    # of the integration step relative to the requested one: errors grow with it
     step_square: float = 1.0
     # camera.params.CameraParams whose keypoints the logs hold, which the simulator knows nothing
     # of; or None

@@ -48,9 +48,7 @@ def add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float) 
 
 
 def new_spec(constraints: bool = False) -> "mujoco.MjSpec":
-    """Return an empty model without contacts, and without other constraints unless they are asked
-    for.
-    """
+    """Return an empty model without contacts, and by default without other constraints."""
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.0, 0.0, -GRAVITY]
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

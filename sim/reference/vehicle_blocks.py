@@ -91,8 +91,8 @@ def mixer(
         Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes
         (E,).
 
-    Convention: yaw takes the largest part of what is asked for that keeps the spread of the four
-    within the limits."""
+    Convention: yaw takes the largest part of the demand that keeps the spread of the four within
+    the limits."""
     spin = np.array(rotors.spin)
     tilt = torque[:, :2] @ _tilting(rotors)
     room = f_max - f_min

@@ -105,7 +105,7 @@ def _make_on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tu
     """
     from sim.reference.batch import Batch
 
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a NaN is to be seen
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # NaN must remain visible
     batch = Batch(model, count, nthread=1)
     for name, value in wide.items():
         batch.expand(name)[:] = value

@@ -52,9 +52,7 @@ Set VISTHROW_TRACEBACK=1 to see where an error came from.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Build the parser; only the chosen command's module is imported and asked for its
-    arguments.
-    """
+    """Build the parser; only the chosen command's module is imported for its arguments."""
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
         "visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form

@@ -8,7 +8,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what was asked."""
+    """Run the chosen action."""
     from visthrow.view import camera_actions
 
     return {

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     check(args.targets, args.throws)
     for name in args.policies or ():
         if name != BASELINE:
-            find_policy(name)  # said before anything heavy is imported
+            find_policy(name)  # printed before heavy imports
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import check_plant
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str, Any]) -> int:
-    """Print and write a comparison; ``figures``: what its JSON says beside the rows."""
+    """Print and write a comparison; ``figures``: entries of its JSON beside the rows."""
     print(comparison.text())
     for path in comparison.write(Path(args.out)):
         print(path)
@@ -186,8 +186,8 @@ def throw_hybrid(
     seed: int,
     calibrate: bool = False,
 ) -> list[list]:
-    """Throw in the training simulator, after a calibration in the hover where asked; for each
-    policy a `Throws` a target.
+    """Throw in the training simulator, after a calibration in the hover where configured; for each
+    policy a `Throws` per target.
     """
     from visthrow.throws.calibrated import start_calibrated
 

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         from visthrow.throws.reference_protocol import Throwing
 
-        # The reference plant flies in a process of its own meanwhile.
+        # The reference plant flies in a separate process meanwhile.
         throws = (loaded, REFERENCE_TARGETS, count, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
             paths = _throw_here(loaded, folder, args.throws)

@@ -23,7 +23,7 @@ add_arguments = declare(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
-    find_policy(args.policy)  # said before anything heavy is imported
+    find_policy(args.policy)  # printed before heavy imports
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy
     from visthrow.throws.recorded import check_goal, fly

@@ -1,6 +1,4 @@
-"""Commands and the options that they share, the exit status of a process, and how it is asked to
-stop.
-"""
+"""Commands and the options that they share, exit statuses, and requests to stop."""
 
 import argparse
 import contextlib

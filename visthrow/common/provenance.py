@@ -45,7 +45,7 @@ def commit() -> str:
     """
     root = Path(__file__).resolve().parents[2]
     variable = os.environ.get(COMMIT_VARIABLE, "unknown")
-    if not (root / ".git").exists():  # installed, or inside somebody else's repository
+    if not (root / ".git").exists():  # installed, or inside another repository
         return variable
     try:
         head = _git(root, "rev-parse", "HEAD")

@@ -1,4 +1,4 @@
-"""Rotations on the host: quaternions are xyzw, from body to world where nothing else is said.
+"""Rotations on the host: quaternions are xyzw, from body to world unless stated otherwise.
 
 Onboard-safe.
 

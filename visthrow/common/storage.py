@@ -25,8 +25,8 @@ SAY_EVERY = 3.0  # between two words on a read [s]
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, so that, whatever happens, the path holds the old content or
-    the whole new one.
+    """Write bytes, or text as UTF-8, so that the path always holds the old content or the whole new
+    one.
 
     The content goes to a temporary file beside it, is flushed to the disk, and takes the name in
     one step; folders are made. Raises StorageError if the disk is full or the place cannot be

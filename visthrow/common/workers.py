@@ -1,7 +1,7 @@
-"""Work done side by side: computations in processes of their own.
+"""Parallel work: computations in separate processes.
 
-Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To go on with
-what was interrupted, a caller keeps each result as it comes and leaves out what is there."""
+Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To resume
+interrupted work, a caller saves each result and skips those that exist."""
 
 import multiprocessing as mp
 import pickle

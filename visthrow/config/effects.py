@@ -2,8 +2,8 @@
 
 Training and diagnosis both apply it, training to plants drawn from what a diagnosis left uncertain.
 
-Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is asked
-for: configurations are read on board too, where no simulator is installed."""
+Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is first
+read: configurations are read on board too, where no simulator is installed."""
 
 from collections.abc import Iterable
 from functools import cache

@@ -143,7 +143,7 @@ class TeamEnv(ThrowEpisodes):
     def _apply(self, actions: Tensor) -> Tensor:
         """Fly one control period; returns the clipped actions.
 
-        Latches trip together, where all asked as long ago as the members know of one another.
+        Latches trip together, once all requests are as old as the members' link delay.
         """
         memory = self.buffers
         action = self._command(actions)

@@ -84,7 +84,7 @@ def throw(args: argparse.Namespace) -> int:
 def _throw_batch(
     loaded, plant: str, looks: dict[str, Any], job
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Throws of one batch, in halls of their own, and what was found in how many frames."""
+    """Throws of one batch, in separate halls, and the numbers of frames with each detection."""
     from visthrow.detector_training.eyes import RenderedEyes
     from visthrow.detector_training.scenes.scene import Nuisances
     from visthrow.throws.reference_protocol import fly_batch

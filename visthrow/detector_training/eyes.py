@@ -61,8 +61,8 @@ def render_hall(
 
 
 class RenderedEyes:
-    """A camera, a hall and a detector for each of E vehicles; the halls were not seen in the
-    detector's training.
+    """A camera, a hall and a detector for each of E vehicles; the detector's training did not use
+    these halls.
 
     Attributes:
         frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2),
@@ -157,8 +157,8 @@ class RenderedEyes:
         return points, valid
 
     def lost(self) -> dict[int, str]:
-        """Return, by vehicle, which of ball and goal was detected too seldom for a throw; asked
-        in a hover.
+        """Return, by vehicle, which of ball and goal was detected too seldom for a throw; called in
+        a hover.
         """
         lost = {
             int(e): name

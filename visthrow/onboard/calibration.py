@@ -61,7 +61,7 @@ CONSTANTS = {
 """Unknowns that stay the same; see `Spreads`."""
 
 LEAST_STEPS = 75  # of a calibration
-LEAST_VISIBLE = 0.5  # share of the steps in which the ball is seen
+LEAST_VISIBLE = 0.5  # share of the steps in which the ball is detected
 ROUNDS = 12  # of Gauss-Newton at most
 SETTLED = 1e-3  # step of a constant in its spreads below which it has settled
 OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
@@ -160,7 +160,7 @@ class Calibration:
         )
 
 
-# standard deviation of the camera's yaw above which it is said to be unknown [rad]
+# standard deviation of the camera's yaw above which it counts as unknown [rad]
 UNKNOWN_YAW = math.radians(2.0)
 
 
@@ -476,8 +476,8 @@ def calibrate(
 def try_calibration(
     hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None
 ) -> Calibration | str:
-    """Return the calibration of a hover, as :func:`calibrate` finds it, or why there is none: a
-    task for another process.
+    """Return the calibration of a hover by :func:`calibrate`, or the reason of its failure: a task
+    for another process.
     """
     try:
         return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)

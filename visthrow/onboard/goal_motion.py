@@ -13,8 +13,8 @@ leaves.
 Where a layout is ``located`` the actor is given the mean goal of all steps. A vision layout is
 given where keypoints lie by the camera as it is configured: the network need then not learn the
 lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by
-what its distance leaves: noise averages out, and it is known while it is out of view. A corner that
-is not seen then reads where the fitted goal would be seen.
+what its distance leaves: noise averages out, and it is known while it is out of view. An invisible
+corner then reads as the fitted goal's projection.
 
 Source: weighted linear regression with a Gaussian prior on the slope (ridge), in sums that are
 carried from step to step."""
@@ -55,7 +55,7 @@ def fit(
         sums: of the steps before, shape (E, 7).
         time: since the throw began [s], shape (E,).
         goal_xy: measured goal [m], shape (E, 2), world frame.
-        weight: inverse variance of it [1/m^2], shape (E,); 0 where the goal was not seen.
+        weight: inverse variance of it [1/m^2], shape (E,); 0 where the goal was not visible.
         fresh: throws that begin here, bool, shape (E,).
 
     Returns:
@@ -141,7 +141,7 @@ def goal_by_corner(
 
     Returns:
         Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E,
-        4); 0 where a corner is not seen.
+        4); 0 where a corner is not visible.
     """
     lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b[None])[:, 0]
     height = lens_w[:, None, 2].clip(min=0.1)
@@ -159,7 +159,7 @@ class GoalEstimate(NamedTuple):
     sums: Array
     velocity: Array  # of the goal [m/s], shape (E, 2), where the layout has it
     places: Array  # where they lie, shape (E, layout.located), where the layout has it
-    frame: Array  # with corners that were not seen where they would be
+    frame: Array  # with invisible corners at their predicted places
     valid: Array
 
 
@@ -229,8 +229,7 @@ def predicted(
     goal_xy: Array,
     is_known: Array,
 ) -> tuple[Array, Array]:
-    """Return the frame, and its validity, with corners that are not seen where the goal so far
-    would be seen.
+    """Return the frame, and its validity, with invisible corners projected from the goal so far.
 
     Args:
         layout, frame, valid, camera: as of :func:`measure_goal`. rot_wb: attitude in the frame,

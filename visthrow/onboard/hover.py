@@ -28,14 +28,14 @@ class HoverParams(BoundedFields):
     Raises ValueError if a gain or limit is negative, or the thrust limits are not ordered.
     """
 
-    position_gain: NotNegative = 1.5  # velocity asked for a metre off [1/s]
+    position_gain: NotNegative = 1.5  # commanded velocity per metre off [1/s]
     velocity_gain: NotNegative = 3.5  # [1/s]
     integral_gain: NotNegative = 3.0  # [1/s^3]
     integral_limit: NotNegative = 1.5  # of each component [m/s^2]
     integral_radius: NotNegative = 0.3  # distance from the goal within which the integral grows [m]
-    max_speed: NotNegative = 1.5  # of the velocity asked for [m/s]
-    max_acceleration: NotNegative = 6.0  # up and down, asked for besides gravity [m/s^2]
-    max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the thrust asked for [rad]
+    max_speed: NotNegative = 1.5  # of the commanded velocity [m/s]
+    max_acceleration: NotNegative = 6.0  # up and down, commanded besides gravity [m/s^2]
+    max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the commanded thrust [rad]
     attitude_gain: NotNegative = 9.0  # [1/s]
     yaw_gain: NotNegative = 2.0  # [1/s]
     max_rate: tuple[NotNegative, NotNegative, NotNegative] = (8.0, 8.0, 2.0)  # [rad/s]
@@ -86,7 +86,7 @@ class HoverController:
             quat_wb: Attitudes, xyzw, shape (E, 4).
             vel_w: Velocities [m/s], shape (E, 3), world frame.
             goal_w: Positions to hold [m], shape (E, 3) or (3,), world frame.
-            mass: Total mass, with whatever hangs below [kg], scalar or shape (E,).
+            mass: Total mass with the load [kg], scalar or shape (E,).
             yaw: Headings to hold [rad], scalar or shape (E,).
 
         Returns:

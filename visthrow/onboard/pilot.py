@@ -58,7 +58,7 @@ class PilotOutput:
     observation: ndarray  # shape (E, D)
     # normalised image coordinates, shape (E, 8, 2); None without a camera
     keypoints: ndarray | None
-    valid: ndarray | None  # which of them are seen, shape (E, 8), bool
+    valid: ndarray | None  # which of them are visible, shape (E, 8), bool
 
 
 class PolicyInput(NamedTuple):
@@ -117,7 +117,7 @@ class Pilot:
         Args:
             policy: on the CPU.
             camera_params: a vision policy's camera; with a state policy keypoints are computed for
-                whoever draws them.
+                drawing.
             count: E. allow: parts of the camera that may differ, as of :meth:`Policy.require`.
         """
         if count < 1:
@@ -174,7 +174,7 @@ class Pilot:
         self._steps = 0
         # of the rows of history and response, newest first; rows beyond copy the oldest [s]
         self._times: tuple[float, ...] = ()
-        # what the action before the last one said of the release
+        # release command of the action before the last one
         self._unasked = self._previous[:, 4]
 
     @property
@@ -204,8 +204,8 @@ class Pilot:
             payload_w: of the payload's centre [m], shape (E, 3).
             goal_w: [m], shape (E, 3) or (3,).
             attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
-            keypoints: what a detector saw, normalised, shape (E, 8, 2), and validity, shape (E, 8),
-                in place of what payload and goal project to; only with a camera.
+            keypoints: of a detector, normalised, shape (E, 8, 2), and validity, shape (E, 8), in
+                place of the projections of payload and goal; only with a camera.
             now: time of this step on any clock [s], where steps may be late or missing; None: they
                 come a period apart.
         """
@@ -251,8 +251,8 @@ class Pilot:
             self._network.step(self._see(*self._shown).observation, self._memory)
 
     def cancel_release(self) -> None:
-        """Say that the release which the last call asked for was not done: the next call is told of
-        none, as in training.
+        """Report that the release which the last call commanded was not done: the next observation
+        holds none, as in training.
         """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 

@@ -7,7 +7,7 @@ Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle
 ``activation``, ``contract`` and ``made_by``. A policy with a memory has its estimator too,
 ``estimator_<field>``, and format version 2.
 
-``contract`` is a nested dictionary of everything that whoever flies the policy must share with its
+``contract`` is a nested dictionary of everything that a flight of the policy must share with its
 training: camera, mount, action limits, release lag, vehicle, observation layout.
 ``contract["observation"]["dimension"]`` and ``contract["action"]["dimension"]``, where given, must
 fit the network. ``made_by`` tells config, commit, command, seed and figures; nothing depends on it.

@@ -1,4 +1,4 @@
-"""Schema of the throwing task and of an experiment: what is flown, seen, rewarded and trained.
+"""Schema of the throwing task and of an experiment: plant, observation, reward and training.
 
 SI units.
 
@@ -504,7 +504,7 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     The camera enters for vision policies only. Noise and randomisation are training matters and
     stay out. An entry whose field has a default enters where it differs from that: a policy from
     before the field was there fits what it is off in. ``whole``: every entry that a contract may
-    have, whatever the policy sees and flies."""
+    have, for any observation and plant."""
     from visthrow.onboard.observations import layout_of
     from visthrow.onboard.pilot import camera_conditions
 

@@ -12,8 +12,8 @@ own size.
 
 The actor is given a vehicle's set-up, ``given``: the throttle that holds it in hover, the share of
 what hangs in the total mass, the lag of the release, and the unit of time [s], by which links and
-sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody knows on board: an upper
-bound, and what the critic is given."""
+sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which is unknown on board: an upper
+bound, and the critic's input."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Throws in the training simulator that begin as a runner's do with a camera of its own: a hover, a
+"""Throws in the training simulator that begin as a runner's with an uncalibrated camera: a hover, a
 sway, a calibration.
 
 What the simulator draws of each vehicle and its camera stays the same in the hover and in the

@@ -1,8 +1,8 @@
 """The flight loop: the vehicles of a plant hover, throw and recover, a batch of them or one.
 
 A flight is a sequence of phases. In a hover the hover controller flies all vehicles. In a throw the
-pilots fly what carries its payload, and the hover controller, which runs along, what has let go or
-failed. A recorder sees each period, whatever it keeps of it."""
+pilots fly vehicles with their payload, and the hover controller, which runs along, those that have
+released or failed. A recorder gets each period."""
 
 import math
 from abc import ABC, abstractmethod
@@ -59,7 +59,7 @@ class Decision:
 
     command: ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: ndarray  # whether the latch is to trip, shape (E,), bool
-    # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
+    # the normalised command, and a policy's release output, shape (E, 4 or 5)
     action: ndarray | None = None
     observation: ndarray | None = None  # of a policy, shape (E, D)
 
@@ -145,7 +145,7 @@ class Policies(Pilots):
         outs = []
         goal_w = flight.goal_at(snapshot.time)
         sighted = None
-        if self.eyes is not None:  # nobody looks any more once all have let go
+        if self.eyes is not None:  # not needed once all have released
             if np.any(flight.flown):
                 sighted = self.eyes.look(flight.plant.exposed, snapshot, goal_w, snapshot.attached)
             else:
@@ -241,9 +241,7 @@ class Flight:
 
     @property
     def now(self) -> Snapshot:
-        """State of the plant, which is asked for it once a period, and only if somebody
-        wants it.
-        """
+        """State of the plant, read at most once a period."""
         self._now = self._now or self.plant.state
         return self._now
 

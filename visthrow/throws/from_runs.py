@@ -59,7 +59,7 @@ def note(logs: list[FlightLog]) -> str:
 
 def entries(logs: list[FlightLog]) -> list[Entry]:
     """Return an entry a policy, its throws by the distance of their goals; policies of one name and
-    other content are told apart.
+    other content are distinguished.
     """
     groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
     for log in logs:

@@ -150,7 +150,7 @@ class HybridPlant:
     def _begin(self) -> None:
         self.time = 0.0
         count = self.count
-        self._state: Snapshot | None = None  # since the last step; made when somebody asks
+        self._state: Snapshot | None = None  # since the last step; made on demand
         self._latched = np.zeros(count, bool)
         self._separation = np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
@@ -257,7 +257,7 @@ class HybridPlant:
 
     @property
     def state(self) -> Snapshot:
-        """See `Plant`; whoever asks within a period gets the same one."""
+        """See `Plant`; all calls within a period get the same one."""
         self._state = self._state or self._snapshot()
         return self._state
 

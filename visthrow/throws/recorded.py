@@ -34,9 +34,9 @@ TRUTH = (*MEASURED, "payload_vel_w", "motor_speed", "battery_voltage", "attached
 
 
 class ThrowRecorder(FlightObserver):
-    """A flight log of one vehicle: what is true at each period's beginning, what is sent then, the
-    rope down to the ground, what the camera sees, and when the release was asked for, ``latch``
-    [s].
+    """A flight log of one vehicle: the true state at each period's beginning, the command sent
+    then, the rope down to the ground, the camera's keypoints, and the time of the release command,
+    ``latch`` [s].
     """
 
     def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:

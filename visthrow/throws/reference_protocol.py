@@ -48,7 +48,7 @@ class Job:
 def batch_plant(
     experiment: Experiment, plant_name: str, target: float, batch: int, count: int, seed: int
 ) -> tuple[Plant, np.random.Generator]:
-    """Plant of one batch, and the generator of its starts: the same for whoever throws."""
+    """Plant of one batch, and the generator of its starts: the same for all policies."""
     seeds = np.random.SeedSequence([seed, round(1000 * target), batch])
     plant_seed = int(seeds.generate_state(1)[0])
     plant = make_plant(plant_name, experiment, count, plant_seed)
@@ -130,8 +130,7 @@ def plan(
 
 
 class Throwing(Workers):
-    """Throws on their way in processes of their own; a context manager that stops them when left
-    early.
+    """Throws that run in separate processes; a context manager that stops them when left early.
 
     >>> plant = "reference-realistic"
     >>> with Throwing(policies, (1.5, 2.0), 200, plant, seed=0) as throwing:  # doctest: +SKIP
@@ -162,7 +161,7 @@ class Throwing(Workers):
             size: throws of a policy in a batch; fewer are sooner done where there are more cores.
                 Other sizes, other draws.
         """
-        importlib.import_module("mujoco")  # said here rather than by every worker
+        importlib.import_module("mujoco")  # printed once, not by every worker
         plant = plant_of(loaded[0].experiment)
         if together and any(plant_of(item.experiment) != plant for item in loaded):
             raise ConfigError("policies of different plants cannot fly in one batch")

@@ -38,7 +38,7 @@ class Result:
     """Throws of one unit.
 
     Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m],
-    ``duration`` [s] and whatever else was measured; NaN where a throw failed."""
+    ``duration`` [s] and further measurements; NaN where a throw failed."""
 
     unit: Unit  # what they depend on
     columns: dict[str, ndarray]
@@ -245,7 +245,7 @@ def work(
     results of all units by key.
 
     Args:
-        units, folder: what is wanted, and where each result is written when it is done.
+        units, folder: the requested units, and where each result is written when it is done.
         function: of a unit, importable by its name; returns columns and extra figures.
         recorded: results from elsewhere, by key; they count as done.
         processes, say: 1 works in this one; receives the progress.

@@ -21,8 +21,8 @@ MECHANISM = 0.06
 firmware's own delay has room within the lag that the policies were trained with.
 """
 
-# share of its weight at which a vehicle leaves its stand: whoever hovers it asks for less than all
-# where it stands too high
+# share of its weight at which a vehicle leaves its stand: a hover commands less than all where it
+# stands too high
 CARRIED = 0.8
 
 

@@ -29,7 +29,7 @@ from visthrow.training.ppo.network import MuonAdam, average_weights, cosine_rate
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 1.0, 0.01, 0.005, 1.0)
-"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-],
+"""Errors of equal weight: of position [m], velocity [m/s], body rates [rad/s], rotation [-],
 action, goal and payload offsets [m], latch.
 """
 
@@ -142,8 +142,8 @@ class Distillation(Algorithm):
 
     @torch.no_grad()
     def _fly(self) -> None:
-        """Fly one batch from new starts and record what was seen, what there was, and until when
-        each throw lasted.
+        """Fly one batch from new starts and record observations, true states, and the length of
+        each throw.
         """
         env = self.env
         policy = self.teacher

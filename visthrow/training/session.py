@@ -1,9 +1,8 @@
 """A training from its beginning or a checkpoint to its policy: log, evaluations on the way,
 checkpoints, an orderly stop.
 
-It stops at its last iteration, at an error that was asked for, by the clock, or at Ctrl-C and
-SIGTERM. Each stop leaves ``policy.npz``, ``checkpoint.pt`` and ``progress.csv`` in the folder of
-the run."""
+It stops at its last iteration, at a requested error, by the clock, or at Ctrl-C and SIGTERM. Each
+stop leaves ``policy.npz``, ``checkpoint.pt`` and ``progress.csv`` in the folder of the run."""
 
 import contextlib
 import json

@@ -1,5 +1,5 @@
-"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the policy
-that comes of it.
+"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the trained
+policy.
 """
 
 import dataclasses

@@ -52,7 +52,7 @@ class Panel:
     title: str
     xlabel: str
     lines: tuple[Line, ...]
-    missing: str = ""  # said where there are no lines
+    missing: str = ""  # text where there are no lines
 
 
 @dataclass(frozen=True)

@@ -243,8 +243,8 @@ def _points(stream, log: FlightLog, entity: str, points: ndarray, visible: ndarr
 
 
 def _outline(stream, log: FlightLog, name: str, points: ndarray, whole: ndarray) -> None:
-    """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a
-    box's edges.
+    """Closed outline of a group while all of it is visible; the payload's four are the midpoints of
+    a box's edges.
     """
     if not whole.any():
         return

@@ -1,4 +1,4 @@
-"""The picture of one throw: the paper's strip of side views, and what the camera saw at the same
+"""The picture of one throw: the paper's strip of side views, and the camera's images at the same
 instants.
 """
 
@@ -19,8 +19,8 @@ from visthrow.view import style
 from visthrow.view.figures import LOOKS
 from visthrow.view.parts import png_of
 
-MARGIN = 0.35  # about what is seen [m]
-GROUND = 0.13  # of it seen below z = 0 [m]
+MARGIN = 0.35  # margin around the visible objects [m]
+GROUND = 0.13  # margin shown below z = 0 [m]
 # widths of the picture, its left margin, a panel, and the gap between two [inch]
 WIDTH = 13.6
 LEFT_MARGIN = 0.62
@@ -189,8 +189,8 @@ def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
 
 
 def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
-    """Keypoints of the true poses at a time, named in the first view; returns whether
-    all are seen.
+    """Keypoints of the true poses at a time, named in the first view; returns whether all are
+    visible.
     """
 
     def one(name: str) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""One look for all pictures: sizes, greys, and colours that are told apart by colour-blind readers.
+"""One style for all pictures: sizes, greys, and colours that colour-blind readers can distinguish.
 
 Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
 """
@@ -21,7 +21,7 @@ PAYLOAD = "#D55E00"
 GOAL = "#009E73"
 FRONT = COLOURS[0]  # rotors
 REAR = "#9AA5B1"
-BEFORE = COLOURS[1]  # a model as it stands
+BEFORE = COLOURS[1]  # the plain model
 AFTER = COLOURS[0]  # the model with what a diagnosis named
 
 

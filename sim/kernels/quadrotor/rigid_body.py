@@ -156,7 +156,7 @@ def build_direct_flow(t: Types):
     """The blocks by-passed: the command is (thrust [N], torque [N m] about x, y, z), acting at once
     and exactly.
 
-    What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
+    The bare dynamics of the tests' scenes, and an idealised vehicle.
     """
     vec3 = t.vec3
     real = t.real

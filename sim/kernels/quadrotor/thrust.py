@@ -19,7 +19,7 @@ def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
 
 @wp.func
 def rotor_thrust_scaled(p: Any, motor_speed: Any, voltage: Any):
-    """Thrust of each rotor [N], shape (4,), with a gain of its own."""
+    """Thrust of each rotor [N], shape (4,), with individual gains."""
     return wp.cw_mul(p.thrust.gain, rotor_thrust(p, motor_speed, voltage))
 
 

@@ -1,5 +1,5 @@
-"""The replay as one kernel: a lane flies one window of a recorded flight from a state of its own
-with parameters of its own.
+"""The replay as one kernel: a lane flies one window of a recorded flight with its initial state and
+parameters.
 
 Every switch of the command, the latch, the separation and the knots of the latent forces end a step
 exactly; measured stamps lie inside steps and are read from the cubic through both ends. One thread

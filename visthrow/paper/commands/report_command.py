@@ -74,7 +74,7 @@ def _folder(name: str) -> Path:
 
 
 def sections(thrown) -> list:
-    """Return the sections, each followed by what somebody wrote beside its data."""
+    """Return the sections, each followed by the text beside its data."""
     from dataclasses import replace
 
     from visthrow.common.workers import status

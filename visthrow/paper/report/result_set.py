@@ -1,4 +1,4 @@
-"""The results that are there, and questions to them."""
+"""The available results, and queries of them."""
 
 import json
 from collections.abc import Iterable
@@ -37,7 +37,7 @@ class ResultSet:
 
     results: tuple[Result, ...]  # sets of throws, batches joined
     runs: tuple[dict[str, Any], ...] = ()  # as the records hold them
-    # section -> text that somebody wrote beside the data
+    # section -> text written beside the data
     findings: dict[str, str] = field(default_factory=dict)
 
     def policies(

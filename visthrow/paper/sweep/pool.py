@@ -125,7 +125,7 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
 
 
 class ProcessPool:
-    """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
+    """Keeps devices and cores busy until a list is done, the time is up or a stop is requested.
 
     Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
     cores, and ``start(task, device, minutes)``, minutes infinite where no end is set. What that

@@ -36,7 +36,7 @@ class ResultSource:
 
     # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
     name: str
-    config: str = ""  # of configs/train; empty for a policy that is there already
+    config: str = ""  # of configs/train; empty for an existing policy
     changes: Changes = ()
     seed: int = 0
     key: str = ""  # of the training; empty likewise
@@ -60,7 +60,7 @@ class ResultSource:
         return self.folder(out) / POLICY if self.config else find_policy(self.name)
 
     def done(self, out: Path) -> bool:
-        """Whether the policy is there, with what the training says of it."""
+        """Whether the policy exists, with the training's record of it."""
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
     def experiment(self) -> Experiment:
@@ -140,7 +140,7 @@ class ThrowUnit:
         return self.source.config, self.source.flown + self.params.changes
 
     def done(self, out: Path) -> bool:
-        """Whether the result is there."""
+        """Whether the result exists."""
         return (
             self.source.done(out)
             and (throws_folder(out) / f"{results.key_of(self.unit(out))}.json").is_file()
@@ -263,5 +263,4 @@ _ANYTHING = (
     *("observation", "action", "control_period", "release"),
     *("vehicle", "rope", "air", "laws", "camera"),
 )
-"""Every section of a contract: here the config is only read; whoever flies states what may differ.
-"""
+"""Every section of a contract: here the config is only read; a flight states what may differ."""

@@ -105,7 +105,7 @@ class FirstOrder(Algorithm):
             # random commands give every observation a spread to start from
             self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
             last = self.network.mlp[-1]
-            last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
+            last.weight.mul_(0.1)  # hover with the latch at rest, for any observation
             last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
