@@ -351,7 +351,7 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
     with opened(
         program(), tmp_path / way, params, endings.NEVER, plant, FakeMocapParams(), 0
     ) as parts:
-        run = endings.Told(way.split(" twice")[0], state, parts, monkeypatch)
+        run = endings.Ending(way.split(" twice")[0], state, parts, monkeypatch)
         fake, clock = run.fake, run.clock
         assert fake.armed, "up to the end of the run"
         low = plant.state["pos_w"][2]
