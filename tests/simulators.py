@@ -48,9 +48,11 @@ def bare_quadrotor(
     control_period: float = 0.02,
     **options: Any,
 ) -> HybridSim:
-    """Return quadrotors without a rope."""
+    """Return quadrotors without a rope; in float64 with the kernel of the ground's effect."""
     sim = numerics(step, precision, control_period)
     plant = replace(paper_plant(), vehicle=vehicle, sim=sim)
+    if precision == "float64":
+        options["extensions"] = frozenset({"ground_effect"})
     return HybridSim(plant, count, without_rope=integrator, **options)
 
 

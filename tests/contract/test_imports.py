@@ -129,7 +129,7 @@ def test_the_core_trains_flies_compares_and_diagnoses_without_the_extras(tmp_pat
         "fly --policy state --out flown --device cpu",
         "compare trained/policy.npz --throws 1 --targets 1.5 --out compared --device cpu",
         "diagnose check flown/flight.npz --no-pictures",
-        "diagnose explain flown/flight.npz --only com_x --no-report --device cpu",
+        "diagnose explain flown/flight.npz --only com_x --no-report --set rope.segments=1",
     ]
     code = f"""
 import sys

@@ -13,7 +13,7 @@ from sim.hybrid import HybridSim
 from sim.params import GRAVITY, AirParams, changed
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
-from tests.plants import EVERYTHING, paper_plant, plain_vehicle
+from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor
 from visthrow.throws.plants import flown
 
@@ -83,7 +83,7 @@ number of segments.
 @mark.parametrize("name", CASES)
 def test_extension_is_the_reference_plants(name):
     of_rope = name in ("payload_drag", "wind", "drag in wind")
-    plain = fine(changed(paper_plant(), {"rope.segments": 5 if of_rope else 1}))
+    plain = fine(changed(paper_plant(), {"rope.segments": 15 if of_rope else 1}))
     extended = changed(plain, CASES[name])
     expected = swing(extended, ReferenceExtras(payload_drag=extended.rope.payload_drag))
     here = swing(extended)
@@ -263,18 +263,12 @@ def test_a_rope_that_gives_is_a_spring(steps):
 
 
 def test_ground_effect_lifts_as_the_formula_says():
-    vehicle = plain_vehicle(paper_plant().vehicle)
+    vehicle = paper_plant().vehicle
     height, effect = 0.06, 1.5
     thrust = vehicle.body.mass * GRAVITY
     rise = []
     for air in (AirParams(), AirParams(ground_effect=effect)):
-        sim = bare_quadrotor(
-            vehicle,
-            precision="float64",
-            control_period=1e-3,
-            airs=[air],
-            extensions=frozenset({"ground_effect"}),
-        )
+        sim = bare_quadrotor(vehicle, precision="float64", control_period=1e-3, airs=[air])
         sim.place(np.array([[0.0, 0.0, height]]))
         sim.set_command([[thrust, 0.0, 0.0, 0.0]])
         sim.step()

@@ -21,7 +21,7 @@ COUNT, RELEASE_STEP = 4, 12
 USUAL = {"rope.segments": 1, "vehicle.queue.delay": 0.0213, "release.lag": 0.1037}
 """A delay and a lag that fall inside substeps. `test_chain_oracle` flies all segments."""
 CASES = {
-    "usual": ({"rope.segments": 5}, 25),
+    "usual": ({"rope.segments": 15}, 25),
     "late by whole periods": ({"vehicle.queue.delay": 0.04}, 10),
     "late by periods and more": ({"vehicle.queue.delay": 0.0467}, 10),
     "at once": ({"vehicle.queue.delay": 0.0}, 10),

@@ -25,7 +25,7 @@ LONGEST = 60
 """Lines of a program."""
 
 RUNS = {
-    "train_mine": ("--minutes 0.02 --environments 8 --out mine", "throws landed"),
+    "train_mine": ("--minutes 1e-6 --environments 8 --out mine", "throws landed"),
     "compare_plants": ("state --throws 1 --plants hybrid", "hybrid     state"),
     "project_poses": ("--seconds 0.1 --port 14777", ""),
     "diagnose_csv": (f"{BALLS} --tracks 1", "tracks, 1 used"),

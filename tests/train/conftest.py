@@ -1,12 +1,15 @@
 """Fixtures of the training tests."""
 
-import os
+import multiprocessing
 import signal
 
 from pytest import fixture
 
-from tests.commands import run_python
 from visthrow.training import trainer
+
+PROCESSES = multiprocessing.get_context("forkserver")
+"""Makes processes that have imported the trainer: once for all."""
+PROCESSES.set_forkserver_preload(["visthrow.training.trainer"])
 
 
 @fixture(autouse=True)
@@ -21,14 +24,15 @@ def few_throws(monkeypatch):
 
 
 KILLED = """
-import os, signal, sys
-from visthrow import cli
+import os, signal, torch
+from tests.commands import run_command
 from visthrow.training.ppo.ppo_training import PPOTraining
+torch.set_num_threads(1)
 learn = PPOTraining.learn
 PPOTraining.learn = lambda self, done: (
     os.kill(os.getpid(), signal.SIGKILL) if done == 3 / 4 else learn(self, done)
 )
-cli.main(sys.argv[1:])
+run_command(*words)
 """
 
 
@@ -39,7 +43,9 @@ def killed():
     """
 
     def run(*words):
-        process = run_python("-c", KILLED, *words, env={**os.environ, "OMP_NUM_THREADS": "1"})
-        assert process.returncode == -signal.SIGKILL, process.stderr
+        process = PROCESSES.Process(target=exec, args=(KILLED, {"words": words}))
+        process.start()
+        process.join()
+        assert process.exitcode == -signal.SIGKILL
 
     return run

@@ -1,6 +1,5 @@
 """A training in two processes: one policy, separate data, and both resume."""
 
-import multiprocessing
 import socket
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from numpy.testing import assert_array_equal
 from pytest import fixture, mark
 
 from tests.configs import load_experiment
+from tests.train.conftest import PROCESSES
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import Trainer
 
@@ -80,10 +80,9 @@ def folder(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["visthrow.training.trainer"])  # once for both
     both = [
-        context.Process(target=process, args=(rank, port, folder), daemon=True) for rank in range(2)
+        PROCESSES.Process(target=process, args=(rank, port, folder), daemon=True)
+        for rank in range(2)
     ]
     for one in both:
         one.start()

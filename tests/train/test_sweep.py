@@ -1,6 +1,7 @@
 """A sweep whose process is killed, and started again."""
 
-from visthrow import cli
+from tests.commands import run_command
+from tests.train.test_train import iterations_of
 from visthrow.paper.sweep.sweep_record import status
 from visthrow.paper.sweep.work_units import load_list
 
@@ -29,19 +30,15 @@ def test_a_killed_sweep_goes_on_and_does_nothing_twice(killed, tmp_path):
     sweep = load_list(str(path))
     (source,) = sweep.sources
     units = ",".join((source.id, *(unit.id for unit in sweep.throws[source.id])))
-    command = f"sweep work {path} --out {out} --units {units} --device cpu".split()
-
-    def iterations():
-        rows = (source.folder(out) / "progress.csv").read_text().splitlines()[1:]
-        return [int(row.split(",")[0]) for row in rows]
-
-    killed(*command)
-    assert iterations() == [1, 2, 3]
+    command = f"sweep work {path} --out {out} --units {units} --device cpu"
+    folder = source.folder(out)
+    killed(command)
+    assert iterations_of(folder) == [1, 2, 3]
     assert not status(sweep, out)[1]
-    assert cli.main(command) == 0
-    assert iterations() == [1, 2, 3, 4]
+    assert run_command(command) == 0
+    assert iterations_of(folder) == [1, 2, 3, 4]
     assert status(sweep, out)[1]
     results = [source.policy(out), *(out / "throws").iterdir()]
     made = [file.stat().st_mtime_ns for file in results]
-    assert cli.main(command) == 0
+    assert run_command(command) == 0
     assert [file.stat().st_mtime_ns for file in results] == made

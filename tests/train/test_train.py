@@ -203,8 +203,7 @@ def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(
 def test_a_killed_training_goes_on_bit_for_bit(whole, killed, tmp_path):
     """Its third iteration is in the log, its checkpoint has two."""
     folder = tmp_path / "run"
-    command, *changes = words(folder, "--checkpoint-every", "2")
-    killed(*command.split(), *changes)
+    killed(*words(folder, "--checkpoint-every", "2"))
     assert iterations_of(folder) == [1, 2, 3]
     assert train(folder, "--resume") == 0
     assert iterations_of(folder) == [1, 2, 3, 4]

@@ -50,7 +50,7 @@ BESIDE_THE_PLAN = {
 
 def hovered(folder, hidden: str) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the vehicle's and the payload's measured places [m] in a hover of a world."""
-    world = f"--set {hidden} --set rope.segments=1 --device cpu"
+    world = f"--set {hidden} --device cpu"
     assert run_command(f"diagnose simulate hover {world} --seed 3 --out {folder}") == 0
     channels = FlightLog.load(folder / "hover-3.npz").channels
     vehicle, payload = (channels[name].values for name in ("pos_w", "payload_pos_w"))
@@ -71,7 +71,7 @@ def test_flights_hold_what_the_world_hides(tmp_path):
 
 def test_a_thrown_payload_falls_and_stays_where_it_lands(tmp_path):
     """It used to hang in the air where it had left the rope, which no cause explains."""
-    thrown = f"diagnose simulate --set rope.segments=1 --device cpu --out {tmp_path}"
+    thrown = f"diagnose simulate --device cpu --out {tmp_path}"
     assert run_command(thrown, "throw at 3 m/s") == 0
     payload = FlightLog.load(tmp_path / "throw_at_3_m_s-0.npz")["payload_pos_w"]
     height = payload.values[:, 2]
@@ -112,7 +112,7 @@ def test_a_thrown_payload_says_how_long_its_cable_was(tmp_path, length):
 
 def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):
     """A gale carries the vehicle off where no payload steadies it; then no log is written."""
-    gale = "--set air.wind_w=[7.7,0.0,0.0] --set rope.segments=1 --device cpu"
+    gale = "--set air.wind_w=[7.7,0.0,0.0] --device cpu"
     flown = "hover", "hover without payload"
     assert run_command(f"diagnose simulate {gale} --out {tmp_path}", *flown) == 2
     assert "'hover without payload': this vehicle leaves its path" in capsys.readouterr().err

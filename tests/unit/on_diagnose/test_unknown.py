@@ -290,10 +290,11 @@ def beside_a_law(model: SyntheticModel, active: list[int], *active_terms: laws.T
 
 
 @mark.parametrize("block", ["vehicle force", "payload force"])
-def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
+def test_all_terms_at_once_say_what_each_says_as_an_effect(block, monkeypatch):
     """Information and score of a column that the windows' inner products were given, and of no
-    further simulation.
+    further simulation. Windows are shared out among threads.
     """
+    monkeypatch.setattr("visthrow.diagnose.likelihood.threads.cores", lambda: 2)
     at = beside_a_law(
         SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )

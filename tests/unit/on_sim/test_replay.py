@@ -174,7 +174,8 @@ def test_release_falls_between_steps(flight):
     assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
 
 
-def test_lanes_do_not_see_each_other(flight):
+def test_lanes_do_not_see_each_other(flight, monkeypatch):
+    monkeypatch.setattr("sim.kernels.replay.lanes.cores", lambda: 2)
     heavy = changed(plant(), {"rope.payload_mass": 0.08})
     rows = np.array([0, 1, 0, 1, 1, 0, 0])
     replayed, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
