@@ -167,6 +167,16 @@ class Point:
         sigmas = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
         return float(np.median(sigmas)) if len(sigmas) else float("nan")
 
+    @cached_property
+    def with_all_effects_noise(self) -> "Point":
+        """Return the point with the noise levels that remain when every effect may have its linear
+        estimate.
+
+        A large missing effect is taken for noise as long as it is not named; these levels show what
+        may be hidden under it."""
+        visible = np.flatnonzero(self.problem.priors.visible & ~self.problem.switches)
+        return with_noise_at(self, self.posterior.estimate(visible))
+
     def evidence(self, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
         misfit = 0.5 * float(self.statistics.absolute.square.sum())
@@ -382,16 +392,6 @@ def curvature(origin: Point, moved_point: Point) -> float:
     total = moved_point.integrals.statistics(grams, moved_point.theta).score.sum(0)
     sizes = moved_point.posterior.covariance(()) @ total
     return float(np.abs(sizes).max(initial=0.0))
-
-
-def with_all_effects_noise(point: Point) -> Point:
-    """Return the point with the noise levels that remain when every effect may have its linear
-    estimate.
-
-    A large missing effect is taken for noise as long as it is not named; these levels show what may
-    be hidden under it."""
-    visible = np.flatnonzero(point.problem.priors.visible & ~point.problem.switches)
-    return with_noise_at(point, point.posterior.estimate(visible))
 
 
 def with_floors_noise(point: Point, active: Sequence[int]) -> Point:

@@ -44,7 +44,6 @@ from visthrow.diagnose.select.point import (
     fitted,
     linearise,
     predicted_gain,
-    with_all_effects_noise,
     with_noise_at,
 )
 from visthrow.diagnose.select.result import SelectionStep
@@ -204,7 +203,7 @@ class Selector:
         """
         present = self.best.chosen
         ahead_of = {}
-        free = with_all_effects_noise(self.best.point)
+        free = self.best.point.with_all_effects_noise
         places = [(self.best.point, present), (free, present)]
         places += [(self.nominal, NOTHING)] if present else []
         for point, centre in places:
