@@ -465,16 +465,12 @@ def test_lost_commands_are_found_beside_a_cause():
     assert share_lost.nats > 50.0
 
 
-def test_lost_commands_are_found_where_one_window_of_all_shows_them():
-    """A command that differs little from the one before is not missed: here eight windows of nine
-    show none of 6 %.
-    """
-    logs = fly(setting_with({}), seed=7, free=1, throws=2, seconds=3.0, lost=0.06)
-    model = model_of(logs, *ONLY)
-    share_lost = dropped.verdict(linearised(model), (), 5.0)
-    assert share_lost is not None
-    assert share_lost.found
-    assert share_lost.nats > 50.0
+def test_few_lost_commands_are_found():
+    """Those that clearly came say little against them."""
+    logs = fly(setting_with({}), seed=10, free=1, throws=2, seconds=3.0, lost=0.03)
+    share, _ = dropped.verdict(linearised(model_of(logs, *ONLY)), (), 5.0)
+    assert share.found
+    assert share.low < 0.03 < share.high
 
 
 def test_a_tilt_that_is_strongly_behind_a_wind_stays_possible():

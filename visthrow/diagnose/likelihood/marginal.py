@@ -118,13 +118,13 @@ class Statistics:
     score: ndarray  # S' V^-1 r, shape (F, K)
     square: ndarray  # r' V^-1 r + log det V, shape (F,)
     samples: ndarray  # shape (F,)
-    theta: ndarray  # shape (K,)
+    theta: ndarray  # shape (K,), or that of each row, shape (F, K)
     days: Sequence[int] = ()  # of each flight; none where the logs do not say
 
     @cached_property
     def absolute(self) -> "Statistics":
         """Return the statistics about theta = 0."""
-        return self.about(np.zeros(len(self.theta)))
+        return self.about(np.zeros(self.score.shape[1]))
 
     def about(self, theta: ndarray) -> "Statistics":
         """Return the statistics of the residuals extrapolated to other sizes, shape (K,), or to
@@ -141,7 +141,7 @@ class Statistics:
             self,
             information=self.information[:, :count, :count],
             score=self.score[:, :count],
-            theta=self.theta[:count],
+            theta=self.theta[..., :count],
         )
 
     def only(self, keep: ndarray) -> "Statistics":

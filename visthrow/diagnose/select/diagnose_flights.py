@@ -191,18 +191,20 @@ def _select(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]
     nominal = plain.nominal
     needed = plain.threshold
     loss = lost_commands.verdict(nominal, (), needed)
-    if (loss is None or not loss.found) and plain.best.columns:
+    if not (loss and loss[0].found) and plain.best.columns:
         loss = lost_commands.verdict(plain.best.point, plain.best.columns, needed)
-    if loss is None or not loss.found:
+    if not (loss and loss[0].found):
         return plain, None
-    lossy = replace(nominal.problem, terms=(), lost=loss.size)
+    share, lost = loss
+    lossy = replace(nominal.problem, terms=(), lost=lost)
     start = linearise(lossy, np.zeros(len(lossy.effects)), nominal.noise)
     lossy_selection = Selector(start, needed, plain.progress, plain.laws).run(begin)
-    gain = lossy_selection.value - needed - plain.value
-    plain.progress(f"commands got lost: {loss.size:.1%} of them, {gain:.1f} nats ahead")
+    cost = needed + sum(lost_commands.divergence(of, share.size) for of in lost)
+    gain = lossy_selection.value - cost - plain.value
+    plain.progress(f"commands got lost: {share.size:.1%} of them, {gain:.1f} nats ahead")
     if gain <= 0.0:
         return plain, None
-    return lossy_selection, lost_commands.sized(start, loss)
+    return lossy_selection, share
 
 
 def correct_interface_mistakes(

@@ -60,7 +60,8 @@ class Problem:
     terms: tuple[
         TermEffect, ...
     ] = ()  # of laws: further effects, whose columns follow from those of the latent forces
-    lost: float = 0.0  # share of the commands that did not come
+    # probability of each command of each window that it did not come; none: all came
+    lost: tuple[ndarray, ...] = ()
 
     @staticmethod
     def of(model: Model, windows: Sequence[Window], numbers: Sequence[int]) -> "Problem":
@@ -89,7 +90,8 @@ class Problem:
 
     def only(self, windows: Sequence[int]) -> "Problem":
         """Return the problem of some of its windows."""
-        return replace(self, kept=tuple(self.kept[w] for w in windows))
+        lost = tuple(self.lost[w] for w in windows) if self.lost else ()
+        return replace(self, kept=tuple(self.kept[w] for w in windows), lost=lost)
 
     def flown(self, theta: ndarray) -> Model | None:
         """The model with the terms at their sizes as its laws; None where their columns do.
@@ -227,7 +229,7 @@ def linearise(
         sizes_of = theta if flown is None else 0.0 * theta
         extended = parallel_map(lambda w: with_terms(w, problem.terms, sizes_of), windows_of)
     if commands:
-        extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
+        extended = [_losing(*parts) for parts in zip(extended, commands, problem.lost)]
     cleaned, raw = _clean(problem, extended)
     noise, grams = levels.fit(cleaned, raw, start)
     integrals = Integrals(grams, noise)
@@ -281,14 +283,14 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: ndarray) -> W
     return replace(window, effects=effects, residual=window.residual - columns @ sizes)
 
 
-def _losing(window: Window, columns: ndarray, share: float) -> Window:
-    """A window some of whose commands did not come: of each that share, and its deviation among
-    what nobody knows.
-    """
-    deviation = np.sqrt(share * (1.0 - share))
-    sd = np.append(window.nuisance_sd, np.full(columns.shape[1], deviation))
+def _losing(window: Window, columns: ndarray, lost: ndarray) -> Window:
+    """A window some of whose commands did not come: the expected part of each, and its deviation
+    among what nobody knows.
+
+    ``lost``: probability of each command that it did not come, shape (T,)."""
+    sd = np.append(window.nuisance_sd, np.sqrt(lost * (1.0 - lost)))
     nuisance = np.hstack((window.nuisance, columns))
-    residual = window.residual - share * columns.sum(1)
+    residual = window.residual - columns @ lost
     return replace(window, residual=residual, nuisance=nuisance, nuisance_sd=sd)
 
 
@@ -362,7 +364,7 @@ def moved(point: Point, theta: ndarray) -> Point | None:
     for k, (i, window) in enumerate(zip(problem.kept, point.windows)):
         residual = simulated[i] - window.effects[:, count:] @ sizes
         if point.commands:
-            residual = residual - problem.lost * point.commands[k].sum(1)
+            residual = residual - point.commands[k] @ problem.lost[k]
         if not np.all(np.isfinite(residual)):
             return None
         residuals.append(residual)
