@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy import ndarray
 
 from hil.errors import RunError
 from hil.poses.pose import Vector
@@ -128,9 +129,7 @@ class PayloadFlight:
         )
 
 
-def separation(
-    times: np.ndarray, points: np.ndarray, expected: float
-) -> tuple[float, Vector] | None:
+def separation(times: ndarray, points: ndarray, expected: float) -> tuple[float, Vector] | None:
     """Return the time [s] and place [m] of the separation: where the poses leave the free fall that
     follows it, extended backwards.
 
@@ -155,7 +154,7 @@ def separation(
     return float(expected + root), tuple(point.tolist())
 
 
-def _parabola(times: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _parabola(times: ndarray, points: ndarray) -> tuple[ndarray, ndarray]:
     """Fit a free fall to poses; return its position and velocity at time 0, shape (3,) each."""
     lifted = points + 0.5 * GRAVITY_UP * times[:, None] ** 2
     fit = np.linalg.lstsq(np.column_stack((np.ones_like(times), times)), lifted, rcond=None)[0]

@@ -13,6 +13,7 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
@@ -83,7 +84,7 @@ class Response:
         self._angle = np.zeros(3)  # turned since the first tick, by poses [rad]
         self._commanded_angles = np.zeros(tried)  # that commands lead to [rad]
         self._before = deque(maxlen=HOVERED)  # reported rates of the autopilot's own hover
-        self._reported: np.ndarray | None = None
+        self._reported: ndarray | None = None
         self.reported = 0
         self._confirmed = np.zeros(3, dtype=bool)  # axes that turned as commanded
 
@@ -167,7 +168,7 @@ class Response:
             return
         self._judge(_scores(self._sums, self._wandering(), self.reported))
 
-    def _wandering(self) -> np.ndarray:
+    def _wandering(self) -> ndarray:
         """Return the variance of a reported rate from tick to tick in the autopilot's own hover
         [rad^2/s^2], shape (3,).
         """
@@ -197,7 +198,7 @@ class Response:
         if self.running and self._ticks == self._ends[-1]:
             self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
-    def _judge(self, scores: np.ndarray) -> None:
+    def _judge(self, scores: ndarray) -> None:
         """Confirm or reject axes by their scores, in deviations, shape (3,)."""
         self._confirmed |= scores > CERTAIN_SIGN
         wrong = (scores < -CERTAIN_SIGN) & ~self._confirmed
@@ -207,7 +208,7 @@ class Response:
             )
 
 
-def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
+def _scores(sums: ndarray, variance: ndarray, count: int) -> ndarray:
     """Return how much better the commanded sign explains each axis than the reverse or no turn
     does, in deviations, shape (3,); negative where the reverse explains it best.
 
@@ -227,7 +228,7 @@ def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
     return np.sign(better) * np.sqrt(np.abs(better))
 
 
-def _misfit(sums: np.ndarray, gains: np.ndarray) -> np.ndarray:
+def _misfit(sums: ndarray, gains: ndarray) -> ndarray:
     """Return the squares that the best time constant, dead time and gain between two leave, shape
     (3,).
     """
@@ -237,5 +238,5 @@ def _misfit(sums: np.ndarray, gains: np.ndarray) -> np.ndarray:
     return misfit.reshape(-1, 3).min(axis=0)
 
 
-def _names(which: np.ndarray) -> str:
+def _names(which: ndarray) -> str:
     return ", ".join(axis for axis, one in zip(AXES, which) if one)

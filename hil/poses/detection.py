@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.detectors.contours import (
     BallSeen,
@@ -77,11 +78,11 @@ class Detections:
         # of the last frame, where it holds the thing
         self._times = {"goal": -np.inf, "ball": -np.inf}
         self._newest = -np.inf
-        self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
+        self._turn: ndarray | None = None  # from the camera as it is mounted to that of training
         self._scale = 0.0
         self._latency = 0.0
-        self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
-        self.fresh: tuple[float, np.ndarray, np.ndarray] | None = None
+        self._path: deque[tuple[float, ndarray, ndarray]] = deque(maxlen=PATH)
+        self.fresh: tuple[float, ndarray, ndarray] | None = None
 
     def correct(self, calibration: Calibration) -> None:
         """Turn rays and carry them forward from now on by what a calibration found."""
@@ -151,14 +152,14 @@ class Detections:
             goal = GoalSeen(rays / np.linalg.norm(rays, axis=1, keepdims=True), goal.score)
         return FrameDetections(ball, goal)
 
-    def _rescale(self, rays_c: np.ndarray) -> np.ndarray:
+    def _rescale(self, rays_c: ndarray) -> ndarray:
         """Return rays, shape (N, 3), by the focal length that was found."""
         lens = self._camera.fisheye
         points, _ = lens.project_normalized(torch.from_numpy(np.ascontiguousarray(rays_c)))
-        rays: np.ndarray = lens.unproject(lens.denormalize(points / (1.0 + self._scale)))[0].numpy()
+        rays: ndarray = lens.unproject(lens.denormalize(points / (1.0 + self._scale)))[0].numpy()
         return rays
 
-    def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
+    def _pose(self, when: float) -> tuple[ndarray, ndarray]:
         """Return the place and the quaternion, of any length, at a time on the path, by straight
         lines; its ends beyond them.
         """
@@ -167,7 +168,7 @@ class Detections:
         pose = np.array([np.interp(when, times, column) for column in columns.T])
         return pose[:3], pose[3:]
 
-    def keypoints(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+    def keypoints(self, time: float) -> tuple[ndarray, ndarray]:
         """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape
         (1, 8).
         """

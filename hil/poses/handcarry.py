@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
+from numpy import ndarray
 
 from hil.errors import RunError
 from hil.links.clock import Clock
@@ -68,7 +69,7 @@ class MeasuredMove:
     after: Pose  # mean of the rest after
 
     @property
-    def way(self) -> np.ndarray:
+    def way(self) -> ndarray:
         """Change of place [m], shape (3,), source's world."""
         return np.subtract(self.after.pos, self.before.pos)
 
@@ -77,7 +78,7 @@ class MeasuredMove:
         """Angle of the change of attitude [rad], whatever the order of the quaternions."""
         return 2.0 * math.acos(min(abs(float(np.dot(self.before.quat, self.after.quat))), 1.0))
 
-    def turns(self, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
+    def turns(self, frames: Frames) -> tuple[ndarray, ndarray]:
         """Return the rotation vectors [rad] of the change of attitude in our world and body."""
         first, second = (frames.quat_from_source(pose.quat) for pose in (self.before, self.after))
         return tuple(
@@ -179,12 +180,12 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
     return CarryResult(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
-def _agreement(turn: np.ndarray, vectors: list[tuple[int, np.ndarray]]) -> float:
+def _agreement(turn: ndarray, vectors: list[tuple[int, ndarray]]) -> float:
     """Return the sum of the cosines between turned vectors and the axes that they belong to."""
     return sum(float((turn @ v)[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
 
 
-def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:
+def _yaw(ways: list[tuple[int, ndarray]], world: ndarray) -> float:
     """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be
     the walker's.
     """

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port
@@ -48,17 +49,17 @@ class WirePlant(Protocol):
 
     period: float
     time: float
-    home_w: np.ndarray
+    home_w: ndarray
     mass: tuple[float, float]
     max_thrust: float
 
-    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+    def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance one period under collective thrust [N] and body rates [rad/s]; the first release
         trips so long into it [s].
         """
 
     @property
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, ndarray]:
         """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached."""
 
     @property
@@ -102,10 +103,10 @@ class SetPoints:
     """
 
     def __init__(self) -> None:
-        self._acting: np.ndarray | None = None
-        self._coming: deque[tuple[float, np.ndarray]] = deque()
+        self._acting: ndarray | None = None
+        self._coming: deque[tuple[float, ndarray]] = deque()
 
-    def add(self, when: float, target: np.ndarray) -> None:
+    def add(self, when: float, target: ndarray) -> None:
         """Take a set-point, thrust [N] and body rates [rad/s], that acts from a time on [s], later
         than those before.
         """
@@ -116,7 +117,7 @@ class SetPoints:
         self._acting = None
         self._coming.clear()
 
-    def flown(self, begin: float, period: float) -> np.ndarray | None:
+    def flown(self, begin: float, period: float) -> ndarray | None:
         """Return what acts in the period from a time on [s]: the mean, where it changes within it;
         None before the first one.
         """
@@ -168,7 +169,7 @@ class Witness:
         if command[0] < 0.0 or any(abs(c) > ROOM * limit for c, limit in zip(command, self.limits)):
             self._note(time, f"command {command} beyond {self.limits}")
 
-    def release(self, time: float, armed: bool, payload_w: np.ndarray) -> None:
+    def release(self, time: float, armed: bool, payload_w: ndarray) -> None:
         """Note a command to open the mechanism."""
         self.releases += 1
         low, high = self.fence
@@ -243,7 +244,7 @@ class Fake(ABC):
         self._count = 0
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
-        self._target: np.ndarray | None = None  # of the set-points that act in this period
+        self._target: ndarray | None = None  # of the set-points that act in this period
         self._last_command = float("-inf")  # when the last set-point was followed [s]
         self._trip: float | None = None  # when the latch of the plant trips [s]
         self.followed = self.ignored = 0
@@ -348,13 +349,13 @@ class Fake(ABC):
         """Return the weight of what flies now [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
-    def hold(self, goal_w: np.ndarray) -> np.ndarray:
+    def hold(self, goal_w: ndarray) -> ndarray:
         """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
         state = self.plant.state
         views = [state[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
 
-    def descend(self) -> np.ndarray:
+    def descend(self) -> ndarray:
         """Return the command that lands where the vehicle is; it disarms once it is down."""
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
@@ -367,7 +368,7 @@ class Fake(ABC):
         """Let the pilot take the vehicle over, and hold it."""
 
     @abstractmethod
-    def flown(self) -> np.ndarray:
+    def flown(self) -> ndarray:
         """Return the command of this period, by whoever flies."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here

@@ -9,6 +9,7 @@ moves nothing. Until the first command it holds its place."""
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links.backends.ardupilot import (
     BRAKE,
@@ -69,7 +70,7 @@ class FakeArduPilot(FakeMavlink):
         result = mav.MAV_RESULT_ACCEPTED if able else mav.MAV_RESULT_FAILED
         self.acknowledge(message.command, ANSWERS.get(self.options.answer, result))
 
-    def flown(self) -> np.ndarray:
+    def flown(self) -> ndarray:
         if self.mode == LAND_MODE:
             return self.descend()
         if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
@@ -79,7 +80,7 @@ class FakeArduPilot(FakeMavlink):
             return np.array([self.weight(), 0.0, 0.0, 0.0])
         return self._meant(self._target)
 
-    def _meant(self, target: np.ndarray) -> np.ndarray:
+    def _meant(self, target: ndarray) -> ndarray:
         """Return the set-point as the parameters make it mean."""
         out = target.copy()
         state = self.plant.state

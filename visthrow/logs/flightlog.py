@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import LogError, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
@@ -48,11 +49,11 @@ class Channel:
     Raises LogError if lengths differ, time does not increase, or a valid sample is not finite.
     """
 
-    time: np.ndarray  # strictly increasing [s], shape (T,), float64
-    values: np.ndarray  # shape (T, ...)
+    time: ndarray  # strictly increasing [s], shape (T,), float64
+    values: ndarray  # shape (T, ...)
     unit: str
     frame: str = "none"
-    valid: np.ndarray | None = None  # shape (T,), bool; None becomes all true
+    valid: ndarray | None = None  # shape (T,), bool; None becomes all true
 
     def __post_init__(self) -> None:
         time = np.asarray(self.time, dtype=np.float64)
@@ -89,19 +90,19 @@ class Channel:
         for name, array in (("time", time), ("values", values), ("valid", valid)):
             object.__setattr__(self, name, array)
 
-    def only(self, keep: np.ndarray) -> "Channel":
+    def only(self, keep: ndarray) -> "Channel":
         """Return some of the samples; ``keep``: shape (T,), bool."""
         return replace(
             self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep]
         )
 
     @property
-    def rows(self) -> np.ndarray:
+    def rows(self) -> ndarray:
         """All samples as rows of numbers, float64, shape (T, components)."""
         width = np.prod(self.values.shape[1:], dtype=int)
         return self.values.reshape(len(self.time), width).astype(float)
 
-    def at(self, time: float) -> np.ndarray:
+    def at(self, time: float) -> ndarray:
         """Return the value at a time [s], linear between samples."""
         values = [np.interp(time, self.time, column) for column in self.rows.T]
         return np.array(values).reshape(self.values.shape[1:])
@@ -111,7 +112,7 @@ class Channel:
         valid = np.asarray(self.valid)
         return Samples(self.time[valid], self.rows[valid])
 
-    def hold(self, time: np.ndarray) -> np.ndarray:
+    def hold(self, time: ndarray) -> ndarray:
         """Return the last valid sample at or before each time (the first one where there is none
         yet).
 
@@ -266,7 +267,7 @@ class FlightRecorder:
     def __init__(self, meta: Mapping[str, Any] | None = None) -> None:
         """Start empty, with metadata of the flight."""
         self.meta = dict(meta or {})
-        self._samples: dict[str, list[tuple[float, np.ndarray, bool]]] = {}
+        self._samples: dict[str, list[tuple[float, ndarray, bool]]] = {}
         self._units: dict[str, tuple[str, str]] = {}
 
     def declare(self, name: str, unit: str, frame: str = "none") -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy import ndarray
 from scipy.signal import correlate, correlation_lags
 
 from visthrow.common.errors import LogError
@@ -113,7 +114,7 @@ def _force(log: FlightLog) -> Samples | None:
     return _magnitude(time, acc + [0.0, 0.0, GRAVITY])
 
 
-def _magnitude(time: np.ndarray, values: np.ndarray) -> Samples:
+def _magnitude(time: ndarray, values: ndarray) -> Samples:
     return Samples(time, np.linalg.norm(values, axis=1, keepdims=True))
 
 
@@ -138,7 +139,7 @@ def _lag(a: Samples, b: Samples) -> tuple[float, float]:
     return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
 
 
-def _vertex(scores: np.ndarray, index: int) -> float:
+def _vertex(scores: ndarray, index: int) -> float:
     """Return where the parabola through a peak and its neighbours is highest, in steps from the
     peak; 0 where it lacks a neighbour or they are level.
     """
@@ -149,7 +150,7 @@ def _vertex(scores: np.ndarray, index: int) -> float:
     return 0.5 * (upper - lower) / curve if curve > 0.0 else 0.0
 
 
-def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, np.ndarray]:
+def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[ndarray, ndarray]:
     """Values of both on a grid of the first's clock, the same for any offset, where
     there are both.
     """
@@ -158,7 +159,7 @@ def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, n
     return a.at(grid), b.at(grid - offset)
 
 
-def _alignment(x: np.ndarray, y: np.ndarray) -> float:
+def _alignment(x: ndarray, y: ndarray) -> float:
     """Correlation of components once one is turned, or mirrored, to fit the other best: the sum of
     the covariance's singular values.
     """

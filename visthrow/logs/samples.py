@@ -5,6 +5,7 @@ Onboard-safe (numpy only)."""
 from typing import NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.rotations import continuous, vectors_between
 
@@ -12,23 +13,23 @@ from visthrow.common.rotations import continuous, vectors_between
 class Samples(NamedTuple):
     """Samples of one quantity."""
 
-    time: np.ndarray  # [s], shape (N,)
-    values: np.ndarray  # shape (N, components)
+    time: ndarray  # [s], shape (N,)
+    values: ndarray  # shape (N, components)
 
-    def at(self, times: np.ndarray) -> np.ndarray:
+    def at(self, times: ndarray) -> ndarray:
         """Interpolate linearly, column by column, at times of shape (..., M): shape
         (..., M, components).
         """
         return on_grid(self.time, self.values, times)
 
-    def attitudes(self, times: np.ndarray) -> np.ndarray:
+    def attitudes(self, times: ndarray) -> ndarray:
         """Attitudes between samples of attitudes xyzw, unit quaternions, straight through those of
         the samples.
         """
         between = on_grid(self.time, continuous(self.values), times)
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
-    def mean_over(self, times: np.ndarray, span: float) -> np.ndarray:
+    def mean_over(self, times: ndarray, span: float) -> ndarray:
         """Mean over ``span`` seconds about each time, shape (M, components)."""
         steps = 0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.time)[:, None]
         whole = np.vstack([0.0 * self.values[:1], np.cumsum(steps, axis=0)])
@@ -53,7 +54,7 @@ class Samples(NamedTuple):
         turns = vectors_between(self.values[first], self.values[last])
         return Samples(middle, turns / width[:, None])
 
-    def _pairs(self, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _pairs(self, span: float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """First and last sample of each stretch of about ``span``, the time in its middle [s] and
         its width [s].
         """
@@ -68,7 +69,7 @@ class Samples(NamedTuple):
         return first, last, 0.5 * (time[first] + time[last]), width[whole]
 
 
-def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def on_grid(time: ndarray, values: ndarray, grid: ndarray) -> ndarray:
     """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N),
     shape (..., N, C).
     """

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy import ndarray
 
 from camera.detectors.contours import Detector, DetectorParams, Prior
 from camera.detectors.following import BallGoalTracker
@@ -104,7 +105,7 @@ class Eyes:
         self._turn = nominal_rot_cb(training.mount).numpy() @ self._rot_cb.T
         self._followed = BallGoalTracker(training.payload_radius, training.goal_side)
 
-    def look(self, picture: np.ndarray, stamp: float) -> Detection:
+    def look(self, picture: ndarray, stamp: float) -> Detection:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
         another size.
         """
@@ -233,14 +234,14 @@ def open_images(params: ImageParams, training: CameraParams, clock: Callable[[],
     )
 
 
-def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
+def _folder(path: Path) -> tuple[Callable[[int], ndarray], list[float]]:
     """Return the reader of the pictures of a folder, and their times [s]."""
     rows = _stamps(path / STAMPS, ("file", "time_s"))
     missing = [name for name, _ in rows if not (path / name).is_file()]
     if missing:
         raise SourceError(f"{path / STAMPS} names {missing[0]}, which is not there")
 
-    def read(index: int) -> np.ndarray:
+    def read(index: int) -> ndarray:
         import cv2
 
         picture = cv2.imread(str(path / rows[index][0]), cv2.IMREAD_COLOR)
@@ -251,7 +252,7 @@ def _folder(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
     return read, [time for _, time in rows]
 
 
-def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
+def _video(path: Path) -> tuple[Callable[[int], ndarray], list[float]]:
     """Return the reader of the frames of a video, and their times [s]; by its own rate where no
     stamps stand beside it.
     """
@@ -272,7 +273,7 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
         times = [i / rate for i in range(int(video.get(cv2.CAP_PROP_FRAME_COUNT)))]
     position = -1
 
-    def read(index: int) -> np.ndarray:
+    def read(index: int) -> ndarray:
         nonlocal position
         good = True
         picture = None

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy import ndarray
 
 from hil.errors import SourceError
 from hil.links.roster import Roster
@@ -100,7 +101,7 @@ def _poses_of_channels(log: FlightLog, body: str) -> list[Pose]:
     ]
 
 
-def _latest(times: np.ndarray, stamps: np.ndarray, age: float) -> np.ndarray:
+def _latest(times: ndarray, stamps: ndarray, age: float) -> ndarray:
     """Return the index of the last time at or before each stamp; -1 without one of at most an age
     [s].
     """

@@ -19,6 +19,7 @@ import struct
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.device import Device, UdpPort
@@ -43,7 +44,7 @@ PATIENCE = 1.0
 FLIP = np.array([1.0, -1.0, -1.0])
 
 
-def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
+def outputs(packet: bytes) -> tuple[int, ndarray] | None:
     """Number of a frame and its servo outputs [us], shape (16,) or (32,); None where the packet
     holds none.
     """
@@ -117,14 +118,14 @@ class ArduPilotSitl(Bridge):
             super().fly()
         self.port.write(state_line(self.plant.time, self.plant), self.port.sender)
 
-    def _frame(self) -> tuple[int, np.ndarray] | None:
+    def _frame(self) -> tuple[int, ndarray] | None:
         while select.select([self.port], [], [], PATIENCE if self.paced else 0.0)[0]:
             frame = outputs(self.port.read() or b"")
             if frame is not None:
                 return frame
         return None
 
-    def flown(self) -> np.ndarray:
+    def flown(self) -> ndarray:
         return self.motors
 
     def report(self) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links import msp
 from hil.links.backends.betaflight import (
@@ -44,9 +45,9 @@ class MotorPlant(WirePlant):
     """The vehicle behind the firmware: it steps under motor commands."""
 
     held: bool
-    quat_wb: np.ndarray
-    rate_b: np.ndarray
-    force_b: np.ndarray
+    quat_wb: ndarray
+    rate_b: ndarray
+    force_b: ndarray
     voltage: float
     touchdown: float | None
 
@@ -70,7 +71,7 @@ class BetaflightSitl(Bridge):
         self.motors = np.zeros(4)
         self.answered = 0
         self.cycles: list[int] = []
-        self._outputs: list[np.ndarray] = []
+        self._outputs: list[ndarray] = []
         self._samples = round(self.plant.period / SAMPLE)
         self._rate_b = self.plant.rate_b  # at the beginning of the last period
         self._sent = 0  # samples in this one
@@ -121,7 +122,7 @@ class BetaflightSitl(Bridge):
         if armed and cycle:
             self.cycles.append(cycle)
 
-    def flown(self) -> np.ndarray:
+    def flown(self) -> ndarray:
         came = np.concatenate(self._outputs)
         self._outputs = []
         if len(came):

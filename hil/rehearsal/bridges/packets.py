@@ -20,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
 import numpy as np
+from numpy import ndarray
 
 from hil.errors import RunError
 from hil.links.facts import values
@@ -93,9 +94,7 @@ class Sensors:
             (0.0, 0.0, 0.0, 1.0),
         )
 
-    def send(
-        self, rates_b: np.ndarray, force_b: np.ndarray, quat_wb: np.ndarray, period: float
-    ) -> np.ndarray:
+    def send(self, rates_b: ndarray, force_b: ndarray, quat_wb: ndarray, period: float) -> ndarray:
         """Send samples, let the firmware run for a period [s] with each, and wait until it has;
         raises `RunError` where it does not run.
 
@@ -116,7 +115,7 @@ class Sensors:
             packets.append(sample(self._stamp, *self._last))
         return self._run(b"".join(packets))
 
-    def _run(self, packets: bytes) -> np.ndarray:
+    def _run(self, packets: bytes) -> ndarray:
         self._socket.send(packets)
         answer = stood(self._stands, PATIENCE)
         if not answer:

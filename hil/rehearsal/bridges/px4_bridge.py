@@ -17,6 +17,7 @@ from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy import ndarray
 
 from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.facts import values
@@ -55,10 +56,10 @@ class Motion(NamedTuple):
     """A vehicle's motion at a time [s]: place [m], velocity [m/s], attitude xyzw, rates [rad/s]."""
 
     time: float
-    pos: np.ndarray
-    vel: np.ndarray
-    quat: np.ndarray
-    rate: np.ndarray
+    pos: ndarray
+    vel: ndarray
+    quat: ndarray
+    rate: ndarray
 
 
 def between(before: Motion, after: Motion, time: float) -> Motion:
@@ -87,7 +88,7 @@ class HangingBall:
     for a rope without length.
     """
 
-    mount_b: np.ndarray  # where the rope hangs [m], shape (3,)
+    mount_b: ndarray  # where the rope hangs [m], shape (3,)
     length: float  # from the mount to the ball's centre [m]
     lag: float  # from the trip of the latch to separation [s]
     mass: tuple[float, float]  # with and without the ball [kg]
@@ -95,7 +96,7 @@ class HangingBall:
     # height of the ball's centre when it has landed, landing_height of the runs [m]
     ground: float = 0.04
     period: float = 0.005  # [s]
-    home_w: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    home_w: ndarray = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         if not self.length > 0.0:
@@ -129,7 +130,7 @@ class HangingBall:
         """Time up to which the vehicle's motion is known [s]."""
         return self._motions[-1].time if self._motions else -math.inf
 
-    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+    def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by a period; see `WirePlant`. The command is PX4's matter."""
         if release and self._trip is None:
             self._trip = self.time + after
@@ -146,10 +147,10 @@ class HangingBall:
         if self._hangs:
             self._advance(self._mount(self._now), time)
 
-    def _mount(self, motion: Motion) -> np.ndarray:
+    def _mount(self, motion: Motion) -> ndarray:
         return motion.pos + matrix_of_quat(motion.quat) @ self.mount_b
 
-    def _advance(self, mount: np.ndarray, time: float) -> None:
+    def _advance(self, mount: ndarray, time: float) -> None:
         """One step of the ball: free flight, then back onto the rope where it is taut
         (position-based, after Mueller et al. 2007).
         """
@@ -178,14 +179,14 @@ class HangingBall:
                 "landing_time": time - (1.0 - share) * STEP,
             }
 
-    def _damp(self, vel: np.ndarray) -> np.ndarray:
+    def _damp(self, vel: ndarray) -> ndarray:
         """Return a velocity relative to the vehicle after a step of damping."""
         speed = float(np.linalg.norm(vel))
         loss = min(2.0 * math.log(2.0) / HALVING * speed, MOST_DAMPING)
         return vel * (1.0 - STEP * loss / max(speed, 1e-9))
 
     @property
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, ndarray]:
         vehicle = self._now
         return {
             "pos_w": vehicle.pos,
@@ -214,7 +215,7 @@ class Place:
         self._pos = np.zeros(3)
         self._vel = np.zeros(3)
 
-    def update(self, time: float, message: Any) -> tuple[np.ndarray, np.ndarray]:
+    def update(self, time: float, message: Any) -> tuple[ndarray, ndarray]:
         """Return place [m] and velocity [m/s] at a time [s], z up, by a HIL_STATE_QUATERNION."""
         vel = FLIP * [rounded(v, 1e-2) for v in (message.vx, message.vy, message.vz)]
         where = [
@@ -314,7 +315,7 @@ class Px4Sih(Bridge):
         """Count the poses' latency on PX4's clock, which is ahead of the ball's."""
         super().deliver(self.plant.until if self.paced else time)
 
-    def flown(self) -> np.ndarray:
+    def flown(self) -> ndarray:
         """Return nothing: PX4 flies."""
         return np.zeros(4)
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import rotate
@@ -288,7 +289,7 @@ def _read_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     return channel if part == "pos_w" else channel.only(np.asarray(channel.valid))
 
 
-def _to_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
+def _to_world(vel: ndarray, odometry: Fields) -> ndarray:
     """Return velocities in the world frame; NaN for a body's without an attitude."""
     quat = np.column_stack([odometry[f"q[{i}]"] for i in (1, 2, 3, 0)]).astype(float)
     with np.errstate(invalid="ignore"):  # of attitudes that are not known
@@ -312,7 +313,7 @@ def _to_local(data: Fields, origins: Fields | None) -> Fields:
     }
 
 
-def valid_rows(fields: Fields, flags: str) -> np.ndarray:
+def valid_rows(fields: Fields, flags: str) -> ndarray:
     """Tell the rows that those of these flags that a message has call valid, bool, shape (T,)."""
     good = np.ones(len(fields["time"]), bool)
     ranges = fields_of_autopilots()["ranges"]
@@ -322,7 +323,7 @@ def valid_rows(fields: Fields, flags: str) -> np.ndarray:
     return good
 
 
-def in_range(values: np.ndarray, smallest: float, largest: float) -> np.ndarray:
+def in_range(values: ndarray, smallest: float, largest: float) -> ndarray:
     """Tell the values within bounds, bool, shape (T,)."""
     numbers = np.asarray(values, float)
     return (numbers >= smallest) & (numbers <= largest)
