@@ -174,7 +174,7 @@ class AutopilotCheck:
     it reports while the vehicle hovers.
     """
 
-    def __init__(self, params: Any, backend: Any) -> None:
+    def __init__(self, params: Any, backend: Any):
         """Begin with nothing heard of the back-end; a dry run has no autopilot."""
         self.backend = backend
         vehicle = params.vehicle

@@ -94,7 +94,7 @@ class Terminal:
         auto_arm: bool = False,
         simulated: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = print,
-    ) -> None:
+    ):
         """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the
         run is ready, to a vehicle that has said that it is simulated and to no other.
         """

@@ -123,7 +123,7 @@ class Detector:
         payload_radius: float,
         goal_side: float,
         params: DetectorParams | None = None,
-    ) -> None:
+    ):
         """Take the lens and the true sizes.
 
         Args:

@@ -55,7 +55,7 @@ class BallTrack:
     across it.
     """
 
-    def __init__(self, ray_w: ndarray, stamp: float, spread: float, rate: float) -> None:
+    def __init__(self, ray_w: ndarray, stamp: float, spread: float, rate: float):
         """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis
         of it [rad] and its rate [rad/s].
         """
@@ -104,7 +104,7 @@ class Square:
 class BallGoalTracker:
     """Tracks of ball and goal in one camera."""
 
-    def __init__(self, radius: float, side: float, ball_w: ndarray | None = None) -> None:
+    def __init__(self, radius: float, side: float, ball_w: ndarray | None = None):
         """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
         lens [m], shape (3,), or with none.
         """

@@ -74,7 +74,7 @@ class PatchNetwork(nn.Module):
     of the patch.
     """
 
-    def __init__(self, side: int, outputs: int) -> None:
+    def __init__(self, side: int, outputs: int):
         super().__init__()
         last = -(-side // 8)
         self.body = nn.Sequential(
@@ -231,7 +231,7 @@ class LearntDetector(Detector):
         goal_side: float,
         params=None,
         networks: Networks | None = None,
-    ) -> None:
+    ):
         """Take the lens, the true sizes and the networks; left out, those that are shipped.
 
         Raises ValueError: a frame whose sides are no multiples of a cell.

@@ -31,9 +31,7 @@ class AimParams(Bounded):
 class ReleaseCheck:
     """Judges the releases that a policy asks for; ``refused`` counts the refusals of this run."""
 
-    def __init__(
-        self, params: AimParams | None, delay: float, height: float, rope: dict[str, Any]
-    ) -> None:
+    def __init__(self, params: AimParams | None, delay: float, height: float, rope: dict[str, Any]):
         """Take what the policy was trained with.
 
         Args:

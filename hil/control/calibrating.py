@@ -41,7 +41,7 @@ class CalibrationParams(Bounded):
 class CalibrationSolver:
     """Estimates calibrations in a process of its own, which starts before the flight."""
 
-    def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads) -> None:
+    def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads):
         """Start the process; arguments as of `visthrow.onboard.calibration.try_calibration`."""
         self._conditions = camera, contract, spreads
         self._pool = ProcessPoolExecutor(1, get_context("spawn"))

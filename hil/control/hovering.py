@@ -16,7 +16,7 @@ DESCENT = 0.4  # speed of the hover point while landing [m/s]
 class Hovering:
     """A hover controller with the place ``place_w`` that it holds [m]."""
 
-    def __init__(self, place_w: Vector, heading: float, max_thrust: float, period: float) -> None:
+    def __init__(self, place_w: Vector, heading: float, max_thrust: float, period: float):
         """Start at a place [m] and heading [rad]; the period is between two commands [s]."""
         self.place_w = place_w
         self._heading = heading

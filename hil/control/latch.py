@@ -181,7 +181,7 @@ class Latch:
         tolerance: float,
         height: float,
         command_delay: float = 0.0,
-    ) -> None:
+    ):
         """Start with the payload hanging; raises `RunError` where the mechanism is slower than the
         policy was trained for.
 

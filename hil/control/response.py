@@ -50,7 +50,7 @@ class Response:
         time: that the vehicle has been ours and judged [s].
     """
 
-    def __init__(self, period: float, mass: float, tolerance: float, probe: float) -> None:
+    def __init__(self, period: float, mass: float, tolerance: float, probe: float):
         """Wait for the first tick.
 
         Args:

@@ -27,7 +27,7 @@ class Guard:
     clipped, slewed and refused.
     """
 
-    def __init__(self, params: GuardParams, max_thrust: float, max_rate: Vector) -> None:
+    def __init__(self, params: GuardParams, max_thrust: float, max_rate: Vector):
         """Take the limits: collective thrust within 0 and ``max_thrust`` [N], body rates within
         ``max_rate`` [rad/s].
         """

@@ -30,7 +30,7 @@ class Clock:
 class MonotonicClock(Clock):
     """The machine's monotonic clock; at ``speed`` 0.5 its second takes two."""
 
-    def __init__(self, speed: float = 1.0) -> None:
+    def __init__(self, speed: float = 1.0):
         """Set the speed; raises `ValueError` for 0 or less."""
         if not speed > 0.0:
             raise ValueError(f"clock speed {speed}; expected above 0")

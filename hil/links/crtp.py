@@ -103,7 +103,7 @@ class CflibPort(Port):
 
     whole = True
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str):
         """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""
         crtp = load_extra("cflib.crtp", "crazyflie", f"the Crazyflie at {address}", LinkError)
         self._packet = load_extra(

@@ -147,7 +147,7 @@ class UdpPort(Port):
 
     whole = True
 
-    def __init__(self, device: Device, option: str = "") -> None:
+    def __init__(self, device: Device, option: str = ""):
         """Open it; raises `LinkError` where the address is taken or not this machine's.
 
         ``option``: as of `refused`.
@@ -203,7 +203,7 @@ class _Stream(Port):
 class TcpPort(_Stream):
     """A TCP connection, opened within two seconds or not at all."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device):
         """Connect; raises `LinkError` where nobody answers."""
         try:
             self._open = socket.create_connection((device.host, device.port), timeout=2.0)
@@ -220,7 +220,7 @@ class TcpPort(_Stream):
 class SerialPort(_Stream):
     """A serial port."""
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: Device):
         """Open it; raises `LinkError` where pyserial is missing, or the port cannot be opened."""
         serial = load_extra("serial", "serial", "a serial port", LinkError)
         try:

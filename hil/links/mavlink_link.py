@@ -54,7 +54,7 @@ class Link:
         tlog: TlogWriter | None = None,
         roster: Roster | None = None,
         key: bytes | None = None,
-    ) -> None:
+    ):
         """Wrap an open port.
 
         Args:
@@ -241,7 +241,7 @@ class LinkSync:
     TIMESYNC clock.
     """
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: Link):
         self._link = link
         self._asked = -1e9
         self._pause = 0.0

@@ -36,7 +36,7 @@ class Parser:
     bytes without a valid signature.
     """
 
-    def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)) -> None:
+    def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)):
         """Take what makes pymavlink's parser, which may ask for signatures."""
         self.errors = 0
         self._make = make
@@ -123,7 +123,7 @@ class Signed(mav.MAVLink):
 
     def __init__(
         self, key: bytes, system: int = 0, component: int = 0, streams: dict | None = None
-    ) -> None:
+    ):
         """Take a key of 32 bytes, ids of the sender, and times of the last valid signatures, of
         another parser of the same link.
         """

@@ -130,7 +130,7 @@ class Roster:
         parties: Iterable[Party] = (),
         allow: Iterable[str] = (),
         tell: Announce = None,
-    ) -> None:
+    ):
         """Wait for all parties; without one, the first valid message of anybody says who is heard
         and answered. ``allow``: addresses that may send at all; none: any.
         """

@@ -91,7 +91,7 @@ class TeamLink:
 
     def __init__(
         self, params: TeamLinkParams, period: float, offset: float = 0.0, remote: bool = False
-    ) -> None:
+    ):
         """Listen at this member's address, for ticks of a period [s].
 
         Raises LinkError: an address is none, is taken, or leaves this machine without ``remote``.

@@ -38,7 +38,7 @@ class Writer:
     ``failed`` counts chunks that were not written, ``why`` the first.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path):
         """Open the file; raises `StorageError` where it cannot be written."""
         try:
             Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ class TlogWriter(Writer):
 class LoggedPort:
     """A port whose traffic is written down, both ways; see :data:`HEAD`."""
 
-    def __init__(self, port: Port, path: str | Path) -> None:
+    def __init__(self, port: Port, path: str | Path):
         """Open the file; raises `StorageError` where it cannot be written."""
         self._port = port
         try:

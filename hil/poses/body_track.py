@@ -44,7 +44,7 @@ class Track:
 
     def __init__(
         self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True
-    ) -> None:
+    ):
         """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does
         without.
         """

@@ -67,7 +67,7 @@ class Detections:
     of the last frame that was taken.
     """
 
-    def __init__(self, camera: KeypointCamera, hold: float) -> None:
+    def __init__(self, camera: KeypointCamera, hold: float):
         """Start with nothing seen by the camera of training; ``hold``: for which a frame counts
         [s].
         """

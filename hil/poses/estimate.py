@@ -77,7 +77,7 @@ class SlopeFilter:
     The rate is worked out when it is asked for: many poses may come between two ticks, and a bare
     ball's is never asked for."""
 
-    def __init__(self, params: EstimateParams) -> None:
+    def __init__(self, params: EstimateParams):
         self.params = params
         self.acceleration: Vector = (0.0, 0.0, 0.0)
         self._window: deque[Pose] = deque(maxlen=MOST_SAMPLES)

@@ -60,7 +60,7 @@ class Frames:
     Plain floats all along: a batch of one in NumPy costs ten times as much, and the same input
     gives the same bits."""
 
-    def __init__(self, params: FrameParams) -> None:
+    def __init__(self, params: FrameParams):
         """Work out the turns; see `FrameParams` for what is refused."""
         self.params = params
         half = math.radians(params.yaw_offset_deg) / 2.0

@@ -84,7 +84,7 @@ class Gate:
     ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
     """
 
-    def __init__(self, params: GateParams) -> None:
+    def __init__(self, params: GateParams):
         self.params = params
         self.refused: Counter[str] = Counter()
         self.restart()

@@ -58,7 +58,7 @@ class Flow:
 class Stream:
     """Watches the poses of one body."""
 
-    def __init__(self, gate: GateParams, estimate: EstimateParams) -> None:
+    def __init__(self, gate: GateParams, estimate: EstimateParams):
         """Take what the gate and the estimate need."""
         self._gate = gate
         self._estimate = estimate

@@ -220,7 +220,7 @@ class Fake(ABC):
         seed: int = 0,
         options: FakeOptions | None = None,
         port: Port | None = None,
-    ) -> None:
+    ):
         """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands
         come by the port, or on the link.
         """
@@ -497,7 +497,7 @@ class Bridge(Fake):
         options: FakeOptions,
         params: Any,
         autopilot: Any = None,
-    ) -> None:
+    ):
         """Connect to an autopilot; ``params`` of its back-end; ``autopilot``: its link or pipe,
         where that is open already.
         """

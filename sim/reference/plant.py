@@ -101,7 +101,7 @@ class ReferencePlant:
         seed: int = 0,
         count: int = 1,
         step: float = 5e-4,
-    ) -> None:
+    ):
         if not step > 0.0:
             raise ValueError(f"plant: step is {step} s, expected more than 0")
         _refuse_unknown(params)

@@ -48,7 +48,7 @@ class RopeDynamics:
         ropes: list[RopeParams],
         stretch: tuple[float, float] | None = None,
         mount_damping: float = 0.0,
-    ) -> None:
+    ):
         self.segments = ropes[0].segments
         self.count = len(ropes)
         self.stretch = stretch

@@ -38,7 +38,7 @@ class Solver(Protocol):
 
     capturable: bool
 
-    def __init__(self, world: "World") -> None:
+    def __init__(self, world: "World"):
         """Build the bodies.
 
         Raises ValueError: something that the engine cannot hold; ModuleNotFoundError: it is not
@@ -108,7 +108,7 @@ class Exchange:
 
     def __init__(
         self, kernels: ExchangeKernels, world: dict[str, Any], build: Callable[[World], Solver]
-    ) -> None:
+    ):
         """Build the solver; ``world``: what :class:`World` is made of but the shared arrays."""
         count = world["count"]
         device = world["device"]

@@ -17,7 +17,7 @@ class ChainSolver:
 
     capturable = True
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World):
         self.world = world
         self._kernel = _kernel(world)
 

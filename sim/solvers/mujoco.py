@@ -44,7 +44,7 @@ class MujocoSolver:
 
     capturable = False  # on a GPU a step is a captured graph of its own
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World):
         self.world = world
         device = world.device
         count = world.count

@@ -105,7 +105,7 @@ class PhysxSolver:
 
     capturable = False
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World):
         self.world = world
         self._gpu = world.device != "cpu"
         ovphysx = _start(world.device)

@@ -154,7 +154,7 @@ def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
 class _Lazy(argparse.ArgumentParser):
     """Asks its module for the arguments only when it is the chosen one."""
 
-    def __init__(self, *args: Any, module: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, module: str | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self._module = module
 
@@ -186,7 +186,7 @@ class StopRequest:
     An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and
     goes on. Threads beside the main one hear no signals."""
 
-    def __init__(self, signals: Sequence[int], message: str = "") -> None:
+    def __init__(self, signals: Sequence[int], message: str = ""):
         """Begin; ``message``: what the first one is answered on the terminal."""
         self.asked = False
         self._said = message

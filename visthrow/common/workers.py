@@ -35,7 +35,7 @@ class Workers:
 
     def __init__(
         self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = ""
-    ) -> None:
+    ):
         """Start at most so many processes.
 
         Args:

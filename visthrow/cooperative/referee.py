@@ -21,7 +21,7 @@ class MujocoTeam:
 
     capturable = False
 
-    def __init__(self, world: World, team: int) -> None:
+    def __init__(self, world: World, team: int):
         """Compile a model a world."""
         self.world = world
         self.team = team

@@ -67,7 +67,7 @@ class TreeSolver:
 
     capturable = True
 
-    def __init__(self, world: World, team: int) -> None:
+    def __init__(self, world: World, team: int):
         self.world = world
         self.team = team
         self.worlds = world.count // team

@@ -82,7 +82,7 @@ class RenderedEyes:
         nuisances: Nuisances | None = None,
         weights: str | None = None,
         keep: bool = False,
-    ) -> None:
+    ):
         """Draw the halls; ValueError for no weights, no photographs.
 
         Args:

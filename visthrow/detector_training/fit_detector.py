@@ -239,7 +239,7 @@ class Fit:
         camera: CameraParams,
         device: str = "cpu",
         files: list[Path] | None = None,
-    ) -> None:
+    ):
         """Start with untrained networks.
 
         Args:

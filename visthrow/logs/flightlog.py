@@ -264,7 +264,7 @@ class FlightLog:
 class FlightRecorder:
     """Collects samples one by one and becomes a ``FlightLog``; what it is given is copied."""
 
-    def __init__(self, meta: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, meta: Mapping[str, Any] | None = None):
         """Start empty, with metadata of the flight."""
         self.meta = dict(meta or {})
         self._samples: dict[str, list[tuple[float, ndarray, bool]]] = {}

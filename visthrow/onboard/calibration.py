@@ -200,7 +200,7 @@ class CalibrationProblem:
 
     def __init__(
         self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads
-    ) -> None:
+    ):
         """Take the measurements, the nominal camera, float64, and of the policy's contract masses
         and rope.
 

@@ -53,7 +53,7 @@ class HoverParams(BoundedFields):
 class HoverController:
     """Position controller with an integral, one for each of E vehicles."""
 
-    def __init__(self, params: HoverParams, period: float, count: int = 1) -> None:
+    def __init__(self, params: HoverParams, period: float, count: int = 1):
         """Start with empty integrals of E vehicles; the period is between two calls [s].
 
         Raises `ValueError`: either is not positive.

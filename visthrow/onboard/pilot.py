@@ -107,7 +107,7 @@ class Pilot:
         camera_params: CameraParams | None = None,
         count: int = 1,
         allow: Collection[str] = (),
-    ) -> None:
+    ):
         """Read the conditions of the policy's contract.
 
         Raises PolicyError: the contract lacks an entry, or a vision policy is given no camera;

@@ -47,7 +47,7 @@ def _activation(name: str) -> Callable[[ndarray], ndarray]:
 class RowPolicy:
     """See `visthrow.onboard.policy.Policy`."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy):
         """Copy the weights of a policy on the CPU."""
         *hidden, self._last = map(_layer, policy.weights, policy.biases)
         self._hidden = hidden
@@ -75,7 +75,7 @@ class RowPolicy:
 class RowEstimator:
     """See `visthrow.onboard.estimator.Estimator`."""
 
-    def __init__(self, estimator: Estimator) -> None:
+    def __init__(self, estimator: Estimator):
         """Copy the weights."""
         e = estimator
         self._mean = e.mean.numpy()

@@ -111,7 +111,7 @@ class Policies(Pilots):
         goal_vel_w: ndarray | None = None,
         draws: bool = False,
         eyes: Sight | None = None,
-    ) -> None:
+    ):
         """Begin with policies that were trained for one plant; goals as of `Pilots`.
 
         ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures
@@ -215,7 +215,7 @@ class Flight:
         pilots: Pilots,
         recorder: FlightObserver | None = None,
         home_w: ndarray | None = None,
-    ) -> None:
+    ):
         """Take over a plant at its start; the recorder receives each period.
 
         ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the
@@ -344,7 +344,7 @@ class Flight:
 class Smoothness:
     """Root mean square change of normalised commands from step to step."""
 
-    def __init__(self, first: ndarray) -> None:
+    def __init__(self, first: ndarray):
         """Begin with the command before the first, shape (E, 4 or more)."""
         self._last = first
         self._sum = np.zeros(len(first))
@@ -371,7 +371,7 @@ class Scores(FlightObserver):
         smoothness: of the pilots' commands.
     """
 
-    def __init__(self, pilots: Pilots) -> None:
+    def __init__(self, pilots: Pilots):
         """Begin before the throw."""
         self.clearance = np.full(len(pilots.goal_w), np.inf)
         self.smoothness = Smoothness(pilots.first_action)

@@ -37,7 +37,7 @@ class LooseRope:
         velocity_w: ndarray,
         ball_w: ndarray,
         ball_vel_w: ndarray,
-    ) -> None:
+    ):
         """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's
         centre [m], [m/s], shape (3,).
         """

@@ -107,7 +107,7 @@ class HybridPlant:
         latency: tuple[float, float] = (0.0, 0.0),
         start: RandomizationParams | None = None,
         motors: bool = False,
-    ) -> None:
+    ):
         """Build the simulator of an experiment's plant.
 
         Args:
@@ -329,7 +329,7 @@ class ReferenceAdapter:
 
     def __init__(
         self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True
-    ) -> None:
+    ):
         """Build the plant; a realistic one has the extras of
         ``configs/vehicle/reference_realistic.toml``.
         """

@@ -39,7 +39,7 @@ class ThrowRecorder(FlightObserver):
     ``latch`` [s].
     """
 
-    def __init__(self, pilots: Policies, meta: dict[str, Any]) -> None:
+    def __init__(self, pilots: Policies, meta: dict[str, Any]):
         self.recorder = FlightRecorder(meta)
         self.pilots = pilots
         self.latch: float | None = None

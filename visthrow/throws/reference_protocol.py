@@ -147,7 +147,7 @@ class Throwing(Workers):
         processes: int | None = None,
         together: bool = False,
         size: int = BATCH,
-    ) -> None:
+    ):
         """Start so many throws of each policy at each target [m] along x.
 
         Raises ConfigError: policies of different plants that are to fly together;

@@ -38,7 +38,7 @@ class HybridWirePlant:
 
     period = 0.005
 
-    def __init__(self, experiment: Experiment, seed: int) -> None:
+    def __init__(self, experiment: Experiment, seed: int):
         """Put the vehicle near its hover point, the rope swinging a little."""
         self._plant = self._build(experiment)
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
@@ -117,7 +117,7 @@ class HybridMotorPlant(HybridWirePlant):
 
     period = 0.002
 
-    def __init__(self, experiment: Experiment, seed: int) -> None:
+    def __init__(self, experiment: Experiment, seed: int):
         super().__init__(experiment, seed)
         controller = experiment.vehicle.controller
         thrust = experiment.vehicle.thrust

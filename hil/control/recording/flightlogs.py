@@ -106,7 +106,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 class TickLogger:
     """Adds ticks to a flight log."""
 
-    def __init__(self, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+    def __init__(self, playback: Playback, provenance: dict[str, Any], start: float):
         """Start an empty log with what is known from a run's beginning on; ``start`` [s] is the
         zero of its pictures.
         """

@@ -49,7 +49,7 @@ class Tick:
 class Playback:
     """Feeds recorded ticks to a ``runner`` of their config and policy."""
 
-    def __init__(self, params: HilParams, policy: Policy) -> None:
+    def __init__(self, params: HilParams, policy: Policy):
         """Start before the first tick; see `hil.control.recording.record.load_run` for both."""
         self.params = params
         self.runner = Runner(params, policy, DryRun())

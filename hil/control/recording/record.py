@@ -67,7 +67,7 @@ def begun(folder: Path) -> Iterator[None]:
 class RunRecorder:
     """Writes a run's folder."""
 
-    def __init__(self, folder: str | Path, params: HilParams) -> None:
+    def __init__(self, folder: str | Path, params: HilParams):
         """Make the folder with config, policy and provenance; raises `StorageError` where it holds
         a run already, or cannot be written.
         """

@@ -45,9 +45,7 @@ BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 class Show:
     """Sends ticks to a stream of rerun."""
 
-    def __init__(
-        self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float
-    ) -> None:
+    def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float):
         """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 

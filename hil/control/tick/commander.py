@@ -55,7 +55,7 @@ class Commander:
         calibration: result for the next tick, or why there is none.
     """
 
-    def __init__(self, parts: FlightParts) -> None:
+    def __init__(self, parts: FlightParts):
         """Start in idle."""
         self.parts = parts
         action = parts.pilot.policy.contract["action"]

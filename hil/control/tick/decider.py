@@ -29,7 +29,7 @@ class Decider:
         inputs: of the machine at the last tick; None before it.
     """
 
-    def __init__(self, parts: FlightParts) -> None:
+    def __init__(self, parts: FlightParts):
         """Start before the first tick."""
         self.parts = parts
         self.inputs: Inputs | None = None

@@ -43,9 +43,7 @@ class FlightParts:
         spent: by the stages of the last tick [s].
     """
 
-    def __init__(
-        self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float
-    ) -> None:
+    def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float):
         """Build the parts; arguments and errors as of `hil.control.tick.runner.Runner`."""
         self.params = params
         self.backend = backend

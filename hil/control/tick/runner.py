@@ -35,7 +35,7 @@ class Runner(FlightParts):
 
     def __init__(
         self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0
-    ) -> None:
+    ):
         """Build all parts; the mechanism's lag is from its command to separation [s].
 
         Raises MismatchError, PolicyError: the camera is not the one that the policy was trained

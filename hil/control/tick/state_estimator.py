@@ -24,7 +24,7 @@ class StateEstimator:
         watcher: called with the body and the track of each accepted pose; None for nobody.
     """
 
-    def __init__(self, parts: FlightParts) -> None:
+    def __init__(self, parts: FlightParts):
         """Start without poses."""
         self.parts = parts
         self.goal_w: Vector | None = None

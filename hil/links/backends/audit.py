@@ -101,7 +101,7 @@ class Audit:
         ask: Callable[[str], None] = lambda name: None,
         write: Callable[[str, float], None] | None = None,
         tell: Announce = None,
-    ) -> None:
+    ):
         """Begin with nothing asked; without rules the audit is done.
 
         ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever

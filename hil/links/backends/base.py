@@ -153,7 +153,7 @@ class Release:
 
     REPEAT = 0.04  # between two sends that have no answer yet [s]; answers take 1 to 3 ms
 
-    def __init__(self, timeout: float, read_back: bool = False) -> None:
+    def __init__(self, timeout: float, read_back: bool = False):
         """Start at rest.
 
         Without a final answer within the time-out [s], and a movement where it is read back, it has
@@ -311,7 +311,7 @@ class OnPort(Autopilot):
     protocol = ""
     params: PortVehicleParams
 
-    def __init__(self, port: Port, params: PortVehicleParams, tell: Announce = None) -> None:
+    def __init__(self, port: Port, params: PortVehicleParams, tell: Announce = None):
         """Take an open port; ``tell`` is handed who is refused."""
         super().__init__()
         self.params = params
@@ -362,7 +362,7 @@ class Held:
     to a slower vehicle's time; for one that acts sooner than the vehicle of the training each
     command waits for the difference."""
 
-    def __init__(self, backend: Backend, hold: float) -> None:
+    def __init__(self, backend: Backend, hold: float):
         """Hold the commands of a back-end back by a time [s]."""
         self._backend = backend
         self._hold = hold

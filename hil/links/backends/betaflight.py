@@ -120,7 +120,7 @@ class Betaflight(OnPort):
         params: BetaflightParams,
         write: bool = False,
         tell: Announce = None,
-    ) -> None:
+    ):
         """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are
         written or not.
         """

@@ -31,7 +31,7 @@ class GyroStream:
             firmware has no such variables.
     """
 
-    def __init__(self, put: Callable[[bytes], bool]) -> None:
+    def __init__(self, put: Callable[[bytes], bool]):
         """Ask by ``put``, which takes a packet's bytes."""
         self._put = put
         self.rates: tuple[float, ...] | None = None

@@ -88,7 +88,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         params: AutopilotParams,
         write: bool = False,
         tell: Announce = None,
-    ) -> None:
+    ):
         """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table.
         Wrong parameters are written or not.
         """

@@ -69,7 +69,7 @@ class Sticks:
 
     SIGNS = (FACTS["roll_sign"], FACTS["pitch_sign"], FACTS["yaw_sign"])
 
-    def __init__(self, params: RatesParams) -> None:
+    def __init__(self, params: RatesParams):
         self._tables = [
             [params.rate(axis, us / TRAVEL) for us in range(TRAVEL + 1)] for axis in range(3)
         ]

@@ -84,7 +84,7 @@ class HoverThrustParams(Bounded):
 class HoverMeter:
     """Mean share of thrust while the vehicle hovers by itself."""
 
-    def __init__(self, params: HoverThrustParams) -> None:
+    def __init__(self, params: HoverThrustParams):
         self.params = params
         self._shares: deque[float] = deque(maxlen=20 * LEAST_SHARES)
 

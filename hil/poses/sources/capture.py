@@ -40,7 +40,7 @@ class Strangers:
     kernel, and counts them.
     """
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str):
         """Take the host's IPv4 address."""
         address = struct.unpack("!I", socket.inet_aton(host))[0]
         rows = (

@@ -80,7 +80,7 @@ class Eyes:
 
     hint: Hint | None = None
 
-    def __init__(self, params: ImageParams, training: CameraParams) -> None:
+    def __init__(self, params: ImageParams, training: CameraParams):
         """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a
         lens that is not at training's place.
         """
@@ -148,7 +148,7 @@ class RecordedImages(Eyes):
     arrival.
     """
 
-    def __init__(self, params: ImageParams, training: CameraParams) -> None:
+    def __init__(self, params: ImageParams, training: CameraParams):
         """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that
         cannot be opened.
         """
@@ -182,7 +182,7 @@ class LiveImages(Eyes):
         training: CameraParams,
         clock: Callable[[], float],
         capture: Any = None,
-    ) -> None:
+    ):
         """Open the camera, or take anything with OpenCV's ``read``; raises `SourceError` where
         there is none of this number.
         """

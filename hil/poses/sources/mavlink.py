@@ -45,7 +45,7 @@ class BodyIds(Bounded):
 class MavlinkDecoder:
     """Messages to poses; bodies told apart by their senders."""
 
-    def __init__(self, bodies: tuple[BodyIds, ...], drop: Drop = lambda message, why: None) -> None:
+    def __init__(self, bodies: tuple[BodyIds, ...], drop: Drop = lambda message, why: None):
         """Take the senders; raises `SourceError` for none, or the same sender and message for two
         bodies. ``drop`` is called for what is a body's and no pose.
         """
@@ -139,7 +139,7 @@ class MavlinkSource(Source):
         bodies: tuple[BodyIds, ...],
         clock: Callable[[], float],
         autopilot_link: Link | None = None,
-    ) -> None:
+    ):
         """Listen to a link, and serve the autopilot's too; ``clock`` gives the arrivals."""
         super().__init__((link,) if autopilot_link is None else (link, autopilot_link), clock)
         self._link, self._decoder = link, MavlinkDecoder(bodies, self._drop)

@@ -108,7 +108,7 @@ class MocapSource(Source):
         link: Link | None = None,
         module: Any = None,
         tell: Announce = None,
-    ) -> None:
+    ):
         """Connect; ``clock`` gives the arrivals, ``link`` is served, ``tell`` is handed what is
         dropped, ``module`` stands for the package, in this process. Raises `SourceError` where that
         is missing, no body is named or by no name of the system, or the system does not answer.

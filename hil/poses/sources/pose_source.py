@@ -22,9 +22,7 @@ class Source:
     ended: bool = False  # nothing will come any more
     stamped: bool = True  # whether stamps are the source's; else they are arrivals
 
-    def __init__(
-        self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0
-    ) -> None:
+    def __init__(self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0):
         """Serve links while it is polled; ``clock`` gives the arrivals [s]."""
         self.links = links
         self._clock = clock
@@ -66,7 +64,7 @@ class Source:
 class RecordedSource(Source):
     """Recorded poses, each handed on when the runner's clock has reached its arrival."""
 
-    def __init__(self, poses: Iterable[Pose], roster: Roster | None = None) -> None:
+    def __init__(self, poses: Iterable[Pose], roster: Roster | None = None):
         """Sort by arrival; poses that arrived together keep their order. ``roster`` counts what of
         the recording is no pose.
 

@@ -80,7 +80,7 @@ class Firmware:
     (``firmware.txt``).
     """
 
-    def __init__(self, program: str | Path, folder: str | Path) -> None:
+    def __init__(self, program: str | Path, folder: str | Path):
         """Name program and folder; nothing runs yet.
 
         Raises `RunError`: there is no such program.

@@ -80,7 +80,7 @@ def stood(stands: int, timeout: float) -> bytes:
 class Sensors:
     """The address of samples, and the firmware's clock."""
 
-    def __init__(self, stands: int) -> None:
+    def __init__(self, stands: int):
         """Open a socket; ``stands``: pipe on which the firmware says that it has come
         to a stamp.
         """

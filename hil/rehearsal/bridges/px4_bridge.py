@@ -203,7 +203,7 @@ class Place:
     velocity bridges.
     """
 
-    def __init__(self, latitude: float, longitude: float, altitude: float) -> None:
+    def __init__(self, latitude: float, longitude: float, altitude: float):
         """Measure from an origin [deg, deg, m]."""
         flat = ECCENTRICITY**2
         curve = 1.0 - flat * math.sin(math.radians(latitude)) ** 2

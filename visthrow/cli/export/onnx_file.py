@@ -15,7 +15,7 @@ OPSET = 18
 class PolicyStep(torch.nn.Module):
     """A policy's step in the form that torch exports."""
 
-    def __init__(self, policy: Policy) -> None:
+    def __init__(self, policy: Policy):
         super().__init__()
         self.policy = policy
 

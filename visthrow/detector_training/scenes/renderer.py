@@ -23,7 +23,7 @@ class Renderer:
         device: str = "cpu",
         files: list[Path] | None = None,
         samples: int = 6,
-    ) -> None:
+    ):
         """Load the photographs. Raises ValueError: no photographs.
 
         Args:

@@ -70,7 +70,7 @@ def lens_row(lens: FisheyeParams, vignetting: float = 0.5) -> Tensor:
 class Draw:
     """Random numbers of one batch, on the CPU: the same seed draws the same on every device."""
 
-    def __init__(self, count: int, seed: int) -> None:
+    def __init__(self, count: int, seed: int):
         """Start a batch."""
         self.count = count
         self.generator = torch.Generator().manual_seed(seed)

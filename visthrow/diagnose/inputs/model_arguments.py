@@ -31,7 +31,7 @@ class Opened:
         logs: as they were read; once the model is built, with their commands corrected.
     """
 
-    def __init__(self, args: argparse.Namespace) -> None:
+    def __init__(self, args: argparse.Namespace):
         """Read the logs.
 
         Raises ConfigError, LogError: as what is read."""

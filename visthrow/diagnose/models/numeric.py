@@ -76,7 +76,7 @@ class NumericModel(Model, ABC):
     needed: Sequence[str] = ()  # channels without which a log holds no window
     inputs: Sequence[str] = ()  # channels that are there and drive the simulation
 
-    def __init__(self, logs: Sequence[FlightLog], params: Any) -> None:
+    def __init__(self, logs: Sequence[FlightLog], params: Any):
         """Cut the logs into windows; ``params``: of the subclass.
 
         An effect that needs any other channel than those that residuals are taken of, or that drive

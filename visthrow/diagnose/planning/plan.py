@@ -55,7 +55,7 @@ class PlanningGoal:
     information for it.
     """
 
-    def __init__(self, diagnosis: Diagnosis, names: Sequence[str] = ()) -> None:
+    def __init__(self, diagnosis: Diagnosis, names: Sequence[str] = ()):
         """Take the classes to be separated, or else what could not be identified, or else every
         effect that can be seen.
 

@@ -314,7 +314,7 @@ class Forward(io.BytesIO):
     back: never in a circle.
     """
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes):
         """Begin at the first byte."""
         super().__init__(data)
         self._returns: Counter[int] = Counter()

@@ -249,7 +249,7 @@ class Controllers(Pilots):
 
     def __init__(
         self, plan: ThrowPlan, experiment: Experiment, period: float, delays: Delays, count: int
-    ) -> None:
+    ):
         """Begin in hover, with the experiment's limits, mount and release; commands come each
         period [s].
         """
@@ -318,7 +318,7 @@ class Controllers(Pilots):
 class _Tracking(Scores):
     """Scores, and how well payloads keep to the plan."""
 
-    def __init__(self, pilots: Controllers) -> None:
+    def __init__(self, pilots: Controllers):
         super().__init__(pilots)
         count = len(pilots.goal_w)
         self.pilots = pilots

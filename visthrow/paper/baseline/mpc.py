@@ -63,7 +63,7 @@ class MPCParams:
 class MPC:
     """Controller of one vehicle."""
 
-    def __init__(self, model: Pendulum, params: MPCParams | None = None) -> None:
+    def __init__(self, model: Pendulum, params: MPCParams | None = None):
         """Build the programme's pattern; it is factorised symbolically once.
 
         ModuleNotFoundError where piqp is not installed.

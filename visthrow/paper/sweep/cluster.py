@@ -24,7 +24,7 @@ LOST_AT_MOST = 3
 class ClusterJob:
     """One submitted task."""
 
-    def __init__(self, job: Any, task: str, lost: Counter[str]) -> None:
+    def __init__(self, job: Any, task: str, lost: Counter[str]):
         self._job = job
         self._task = task
         self._lost = lost

@@ -132,9 +132,7 @@ class ProcessPool:
     returns has ``poll()`` for the exit status, None while it runs, ``stop()`` to write what it has
     and end, and ``kill()``."""
 
-    def __init__(
-        self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]
-    ) -> None:
+    def __init__(self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]):
         self.work = work
         self.out = out
         self.starter = starter

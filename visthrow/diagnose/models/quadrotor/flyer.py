@@ -41,7 +41,7 @@ class FlyerModel(DrivenModel):
 
     table = "flyer"
 
-    def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
+    def __init__(self, logs: Sequence[FlightLog], params: FlyerParams):
         """See the base class."""
         optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
         simulated = [name for name, part in optional.items() if part is not None]

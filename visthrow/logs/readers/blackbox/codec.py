@@ -34,7 +34,7 @@ class Corrupt(Exception):
 class Reader:
     """A position in the bytes of one log."""
 
-    def __init__(self, data: bytes, pos: int = 0) -> None:
+    def __init__(self, data: bytes, pos: int = 0):
         """Stand at ``pos``."""
         self.data = data
         self.pos = pos

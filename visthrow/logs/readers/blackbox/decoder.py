@@ -109,7 +109,7 @@ def read_blackbox(path: str | Path) -> list[BlackboxLog]:
 class _Decoder:
     """Decodes one log: header lines, then frames until the end."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes):
         self.header: dict[str, str] = {}
         self.fields: dict[str, Fields] = {}
         self.reader = Reader(data, self._read_header(data))
