@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from camera.field_bounds import Bound, BoundedFields, Length, NotNegative, Positive, Share
+from camera.field_bounds import Bound, BoundedFields, Length, NotNegative, Positive, Share, Vector
 
 SMALLEST_VIEW = math.radians(1.0)
 """Angle off the axis that any lens must image [rad]."""
@@ -93,9 +93,9 @@ class MountParams(BoundedFields):
     Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative pitch lets it look forward."""
 
     # lens from the centre of mass [m], body frame
-    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position_b: Vector = (0.0, 0.0, 0.0)
     # roll, pitch, yaw from the downward pose [deg], about body axes
-    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
     rotation_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [rad]
     position_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [m]
 

@@ -23,7 +23,7 @@ from hil.poses.body_track import MOST_PREDICTION
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
-from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE
+from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Vector
 from hil.poses.sources.images import ImageParams
 from hil.poses.sources.mavlink import BodyIds
 from hil.poses.sources.motion_capture import MocapParams, RigidBody
@@ -119,8 +119,8 @@ class HilParams(Bounded):
     # Such a run waits for poses and checks without a time-out.
     observe: bool
     throws: Annotated[int, Bound(1)]  # after which the run lands
-    goal_w: tuple[float, float, float]  # target where no body is the goal [m]
-    home_w: tuple[float, float, float]  # hover point [m]
+    goal_w: Vector  # target where no body is the goal [m]
+    home_w: Vector  # hover point [m]
     landing_height: float  # of the payload's centre as it lands [m]
     link: LinkParams
     source: SourceParams

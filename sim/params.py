@@ -24,6 +24,8 @@ from camera.field_bounds import (
     NotNegative,
     Positive,
     Share,
+    Spread,
+    Vector,
 )
 from sim.law_factors import LAW_FACTORS
 
@@ -63,7 +65,7 @@ class BodyParams(BoundedFields):
     mass: Mass  # [kg]
     # principal moments about the centre of mass [kg m^2]
     inertia: tuple[Positive, Positive, Positive]
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)  # see VehicleParams [m]
+    com: Vector = (0.0, 0.0, 0.0)  # see VehicleParams [m]
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,11 @@ class ControllerParams(BoundedFields):
     k_f)``."""
 
     kind: Literal["betaflight", "motor_mixing", "geometric"]
-    p_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s/rad]
-    i_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m/rad]
-    d_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s^2/rad]
-    feedforward_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s^2/rad]
-    integral_limit: tuple[NotNegative, NotNegative, NotNegative]  # [N m]
+    p_gain: Spread  # [N m s/rad]
+    i_gain: Spread  # [N m/rad]
+    d_gain: Spread  # [N m s^2/rad]
+    feedforward_gain: Spread  # [N m s^2/rad]
+    integral_limit: Spread  # [N m]
     setpoint_time_constant: Duration  # [s]
     gyro_time_constant: Duration  # [s]
     min_thrust: NotNegative  # f_min a motor, idle [N]
@@ -151,7 +153,7 @@ class ControllerParams(BoundedFields):
     # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
     relax_threshold: Positive = 0.698
     # of the lag of g that P and I of ``motor_mixing`` see [-]
-    gyro_share: tuple[NotNegative, NotNegative, NotNegative] = (1.0, 1.0, 1.0)
+    gyro_share: Spread = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -320,7 +322,7 @@ class RopeParams(BoundedFields):
     payload_offset: NotNegative  # [m]
     payload_radius: NotNegative  # of the ball, for drawing, keypoints and collisions [m]
     joint_damping: NotNegative  # [N m s]
-    mount: tuple[float, float, float]  # rope attachment in the body frame [m]
+    mount: Vector  # rope attachment in the body frame [m]
     # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     payload_drag: NotNegative = 0.0
     mount_damping: NotNegative = 0.0  # of the uppermost joint, besides joint_damping [N m s]
@@ -330,7 +332,7 @@ class RopeParams(BoundedFields):
     payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
     compliance: NotNegative = 0.0  # lengthening for every newton of pull [m/N]
     # of a box that swings about its upper face, homogeneous [m]; 0: a ball, rigid on the rope
-    payload_sides: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
+    payload_sides: Spread = (0.0, 0.0, 0.0)
     # of two cables without mass, along body x, that hold the box in the rope's place [m]; 0: a rope
     cables_apart: NotNegative = 0.0
     gripper_mass: NotNegative = 0.0  # at the rope's lower end, which holds the payload [kg]
@@ -367,7 +369,7 @@ class RopeParams(BoundedFields):
         """Mass of each segment [kg]."""
         return self.rope_mass / self.segments
 
-    def rod(self, loaded: bool) -> tuple[float, float, float]:
+    def rod(self, loaded: bool) -> Vector:
         """Return a segment's mass [kg], its centre of mass below the upper end [m] and its
         transverse inertia about that [kg m^2]; the payload is part of a ``loaded`` one.
         """
@@ -410,7 +412,7 @@ class AirParams(BoundedFields):
     z)^2) - 1)`` with R the propeller's radius and z the height of the vehicle's centre of mass, not
     below R / 2 (Cheeseman and Bennett 1955 for ``ground_effect`` 1)."""
 
-    wind_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
+    wind_w: Vector = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
     ground_effect: float = 0.0  # [-]
 
 
@@ -436,7 +438,7 @@ class ReleaseParams(BoundedFields):
     # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
     lag_tension: float = 0.0
     # speed that the mechanism gives the payload, world frame [m/s]
-    kick_w: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    kick_w: Vector = (0.0, 0.0, 0.0)
     kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
     rope_tail: Share = 0.0  # share of the rope that leaves with the payload [-]
 
@@ -547,11 +549,11 @@ class SensingParams(BoundedFields):
     clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
     scale: float = 0.0  # of measured lengths [-]
     # world against the measured frame [rad]
-    frame_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    marker_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad]
-    marker_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # body frame [m]
-    payload_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world frame [m]
-    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad/s]
+    frame_tilt: Vector = (0.0, 0.0, 0.0)
+    marker_rotation: Vector = (0.0, 0.0, 0.0)  # [rad]
+    marker_offset: Vector = (0.0, 0.0, 0.0)  # body frame [m]
+    payload_offset: Vector = (0.0, 0.0, 0.0)  # world frame [m]
+    gyro_bias: Vector = (0.0, 0.0, 0.0)  # [rad/s]
     camera_delay: float = 0.0  # of the keypoints' stamps [s]
     camera_line_time: float = 0.0  # between two rows of the image [s]
 
@@ -565,10 +567,10 @@ class RandomizationParams(BoundedFields):
     on top of the body's."""
 
     spawn_height: float  # of the vehicle's centre of mass [m]
-    position: tuple[NotNegative, NotNegative, NotNegative]  # +- [m]
-    velocity: tuple[NotNegative, NotNegative, NotNegative]  # +- [m/s]
-    attitude_deg: tuple[NotNegative, NotNegative, NotNegative]  # +- roll, pitch, yaw [deg]
-    rate_deg: tuple[NotNegative, NotNegative, NotNegative]  # +- body rates [deg/s]
+    position: Spread  # +- [m]
+    velocity: Spread  # +- [m/s]
+    attitude_deg: Spread  # +- roll, pitch, yaw [deg]
+    rate_deg: Spread  # +- body rates [deg/s]
     mass: NotNegative  # +- fraction of the vehicle's mass
     cable_angle_deg: NotNegative  # +- roll of the cable [deg]
     cable_rate_deg: NotNegative  # +- rates of its roll and yaw [deg/s]

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
-from visthrow.common.rotations import conjugate, multiply, rotate_one, rotation_vector
+from visthrow.common.rotations import Vector, conjugate, multiply, rotate_one, rotation_vector
 from visthrow.onboard.hover import GRAVITY
 
 AXES = ("roll", "pitch", "yaw")
@@ -97,7 +97,7 @@ class Response:
         """Whether the first hover is still being judged."""
         return self._probe > 0.0 and self.problem is None and not self._confirmed.all()
 
-    def rates(self) -> tuple[float, float, float]:
+    def rates(self) -> Vector:
         """Return the doublet's body rates of this tick [rad/s]; of axes that are known, none."""
         if not self.running or self._ticks >= len(self._signs):
             return (0.0, 0.0, 0.0)

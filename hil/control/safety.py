@@ -64,10 +64,10 @@ class Guard:
 class FenceParams(Bounded):
     """Boxes in our world that vehicle and payload may not leave; the goal is in the payload's."""
 
-    vehicle_low: tuple[float, float, float]  # [m]
-    vehicle_high: tuple[float, float, float]  # [m]
-    payload_low: tuple[float, float, float]  # [m]
-    payload_high: tuple[float, float, float]  # [m]
+    vehicle_low: Vector  # [m]
+    vehicle_high: Vector  # [m]
+    payload_low: Vector  # [m]
+    payload_high: Vector  # [m]
     deceleration: Positive  # that the vehicle brakes with [m/s^2]
 
     def __post_init__(self) -> None:

@@ -29,7 +29,7 @@ NEAR_EDGE = 0.85
 PATH = 25  # ticks that the vehicle's way is kept for: half a second
 
 PARTS = {"goal": slice(0, GOAL_KEYPOINTS), "ball": slice(GOAL_KEYPOINTS, None)}  # of the keypoints
-Corners = tuple[tuple[float, float, float], ...]
+Corners = tuple[Vector, ...]
 
 
 @dataclass(frozen=True)

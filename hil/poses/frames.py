@@ -44,7 +44,7 @@ class FrameParams(Bounded):
     quaternion: Literal["xyzw", "wxyz"]  # order of the source's quaternions
     yaw_offset_deg: float  # turn about our world z after the exchange of axes
     # of the tracked point from the centre of mass [m], our body frame
-    marker_offset_b: tuple[float, float, float]
+    marker_offset_b: Vector
 
     def __post_init__(self) -> None:
         super().__post_init__()

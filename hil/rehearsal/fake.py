@@ -19,7 +19,7 @@ from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.roster import SIMULATED
 from hil.poses.frames import FrameParams, Frames
-from hil.poses.pose import PAYLOAD, Pose
+from hil.poses.pose import PAYLOAD, Pose, Vector
 from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams, Mocap
 from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
@@ -149,7 +149,7 @@ class Witness:
     """
 
     limits: tuple[float, float, float, float]
-    fence: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+    fence: tuple[Vector, Vector] = (
         (-3.0, -3.0, -0.05),
         (3.0, 3.0, 3.0),
     )

@@ -4,10 +4,7 @@ default.
 
 from dataclasses import dataclass
 
-from camera.field_bounds import BoundedFields, NotNegative, Positive
-
-Vector = tuple[float, float, float]
-Spread = tuple[NotNegative, NotNegative, NotNegative]
+from camera.field_bounds import BoundedFields, NotNegative, Positive, Spread, Vector
 
 
 @dataclass(frozen=True)

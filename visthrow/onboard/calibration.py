@@ -35,7 +35,7 @@ from camera.params import CameraParams
 from visthrow import config
 from visthrow.common.errors import VisthrowError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.config.bounds import Bounded, Positive
+from visthrow.config.bounds import Bounded, Positive, Vector
 from visthrow.onboard.observations import rotation_from_quat
 
 STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
@@ -120,8 +120,8 @@ class Calibration:
     """The estimates from a hover, each with its standard deviation."""
 
     # of the camera from its nominal pose: roll, pitch, yaw [rad]
-    turn_b: tuple[float, float, float]
-    turn_sigma: tuple[float, float, float]  # [rad]
+    turn_b: Vector
+    turn_sigma: Vector  # [rad]
     latency: float  # of the keypoints beyond the poses' and beyond what is stated [s]
     latency_sigma: float  # [s]
     thrust: float  # that acts, over what is commanded [-]

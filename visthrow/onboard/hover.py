@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from numpy import ndarray
 
-from camera.field_bounds import Bound, BoundedFields, NotNegative
+from camera.field_bounds import Bound, BoundedFields, NotNegative, Spread
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 
@@ -38,7 +38,7 @@ class HoverParams(BoundedFields):
     max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the commanded thrust [rad]
     attitude_gain: NotNegative = 9.0  # [1/s]
     yaw_gain: NotNegative = 2.0  # [1/s]
-    max_rate: tuple[NotNegative, NotNegative, NotNegative] = (8.0, 8.0, 2.0)  # [rad/s]
+    max_rate: Spread = (8.0, 8.0, 2.0)  # [rad/s]
     min_thrust: NotNegative = 0.2  # [N]
     max_thrust: NotNegative = 14.0  # [N]
 

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numpy import ndarray
 
+from camera.field_bounds import Vector
 from camera.fisheye import AXIS_EPSILON, Fisheye
 from camera.keypoints import (
     DIRECTION_EPSILON,
@@ -17,8 +18,6 @@ from camera.keypoints import (
     apply_invalid_rule,
     box_midpoints,
 )
-
-Vector = tuple[float, float, float]
 
 
 def row_keypoints(

@@ -28,7 +28,7 @@ from sim.params import (
 from sim.scaling.vehicle_class import FleetParams
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
+from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive, Spread, Vector
 
 Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
@@ -46,7 +46,7 @@ class ActionParams(Bounded):
 
     # body rates at +-1 [rad/s] and collective thrust at +1 [N]; an experiment replaces 0 by its
     # vehicle's
-    max_rate: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
+    max_rate: Spread = (0.0, 0.0, 0.0)
     max_thrust: NotNegative = 0.0
 
 
@@ -134,7 +134,7 @@ class RewardParams(Bounded):
     angular_velocity: float  # alpha_omega
     relative_velocity: float  # alpha_p
     smoothness: float  # beta
-    rate_command: tuple[float, float, float]  # c^omega
+    rate_command: Vector  # c^omega
     command_change: tuple[float, float, float, float]  # c^Delta
     l1_mix: float  # eta
     carry_time: float  # gamma_t [1/s]
@@ -395,7 +395,7 @@ class Experiment:
             raise ConfigError(wrong)
 
 
-def _largest_rates(vehicle: VehicleParams) -> tuple[float, float, float]:
+def _largest_rates(vehicle: VehicleParams) -> Vector:
     """Return the largest body rates that a vehicle is commanded [rad/s].
 
     They are at most those that a 3-inch quadrotor follows well. A rate error of the largest rate

@@ -12,7 +12,7 @@ from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.overlay import draw_overlay
 from camera.params import CameraParams
 from visthrow.common.errors import LogError
-from visthrow.common.rotations import matrix_of_quat
+from visthrow.common.rotations import Vector, matrix_of_quat
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import style
@@ -115,7 +115,7 @@ def shrink_lens(camera: CameraParams) -> CameraParams:
     return dataclasses.replace(camera, fisheye=dataclasses.replace(lens, **size, **focus))
 
 
-def _bounds(log: FlightLog) -> tuple[float, float, float]:
+def _bounds(log: FlightLog) -> Vector:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
     paths = []
@@ -134,9 +134,7 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 
 
-def _side_view(
-    axis, log: FlightLog, time: float, side: tuple[float, float, float], column: int
-) -> None:
+def _side_view(axis, log: FlightLog, time: float, side: Vector, column: int) -> None:
     from matplotlib.patches import Circle, Rectangle
 
     origin_x, right, top = side
