@@ -3,7 +3,6 @@ checkpoints, resume.
 """
 
 import argparse
-from dataclasses import fields
 
 from visthrow.common.arguments import declare
 
@@ -14,7 +13,4 @@ def run(args: argparse.Namespace) -> int:
     """Train."""
     from visthrow.training import session
 
-    options = session.Options(
-        **{item.name: getattr(args, item.name) for item in fields(session.Options)}
-    )
-    return session.run(options)
+    return session.run(args)

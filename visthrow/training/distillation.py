@@ -8,6 +8,7 @@ states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation t
 throw. Throws that the exact observation flies would teach it to read the truth out of the action
 before."""
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -221,9 +222,7 @@ class Distillation(Algorithm):
         t = self.teacher.to("cpu")
         parts = self.average.module.frozen().parts()
         estimator = Estimator.from_parts({name: part.cpu().clone() for name, part in parts.items()})
-        return Policy(
-            t.weights, t.biases, t.activation, contract, made_by, t.mean, t.std, t.eps, estimator
-        )
+        return replace(t, contract=contract, made_by=made_by, estimator=estimator)
 
     def take_up(self, policy: Policy) -> None:
         e = policy.estimator

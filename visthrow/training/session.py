@@ -58,8 +58,8 @@ class Options:
     json: str | None = None
 
 
-def run(args: Options) -> int:
-    """Train; returns the exit status of the command."""
+def run(args: Any) -> int:
+    """Train by :class:`Options`, or as many attributes; returns the exit status of the command."""
     _check(args)
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
