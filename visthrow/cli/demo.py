@@ -8,7 +8,6 @@ from pathlib import Path
 
 from visthrow.cli import compare, fly
 from visthrow.common.arguments import declare
-from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
 
 # on the reference plant, for each policy; one such throw costs seconds
@@ -28,8 +27,6 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.throws.loading import load_policy
     from visthrow.view.tables import PAPER_NOTE
 
-    if args.throws < 1:
-        raise ConfigError(f"--throws {args.throws}; expected 1 or more")
     begin = time.perf_counter()
     count = min(args.throws, REFERENCE_THROWS)
     loaded = [load_policy(name) for name in compare.DEFAULT_POLICIES]

@@ -104,13 +104,7 @@ def run(args: Any) -> int:
 
 
 def _check(args: Options) -> None:
-    """Refuse numbers that stop nothing or everything, and words that contradict each other, with a
-    TrainError.
-    """
-    for name in ("iterations", "minutes", "until", "evaluate_every", "checkpoint_every"):
-        value = getattr(args, name)
-        if value is not None and not value > 0:
-            raise TrainError(f"--{name.replace('_', '-')} {value}; expected a number above 0")
+    """Refuse words that contradict each other, with a TrainError."""
     if args.until is not None and args.until >= EVALUATION_TARGET:
         raise TrainError(
             f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error"

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.view import page
     from visthrow.view.parts import Section
 
-    compare.check(args.targets, args.throws)
+    compare.check(args.targets)
     for plant in args.plants:
         check_plant(plant)
     out = Path(args.out)

@@ -84,6 +84,8 @@ def advance(
 ):
     """Make state k + 1 of state k and the commands up to k."""
     dt = p.period
+    decay = p.decay
+    after = k + 1
     up = wp.vec3(0.0, 0.0, 1.0)
     mass = p.mass[e]
     load_mass = p.load_mass[e]
@@ -95,37 +97,36 @@ def advance(
         y += wp.cw_mul(p.response[1], x.response[k - 1, e])
     for j in range(wp.min(p.response.shape[0] - 2, k + 1)):
         y += wp.cw_mul(p.response[2 + j], command(p, action, k - j, e))
-    y = response_at(x.response[k + 1, e], y)
+    y = response_at(x.response[after, e], y)
     mean = 0.5 * (x.response[k, e] + y)
     half_turn = 0.5 * dt * wp.vec3(mean[1], mean[2], mean[3])
     square = wp.dot(half_turn, half_turn)
     turn = wp.quat(half_turn * (1.0 - square / 6.0), 1.0 - 0.5 * square)
-    rot_next = turn_at(x.quat[k + 1, e], rot * turn)
+    rot_next = turn_at(x.quat[after, e], rot * turn)
     z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
     drag_b = wp.cw_mul(wp.vec3(p.force[1], p.force[2], p.force[3]), wp.quat_rotate_inv(rot, vel))
     f = p.force[0] * mean[0] * z - wp.quat_rotate(rot, drag_b)
 
     slip = load_vel - vel
-    arm = vector_at(
-        0.5 * (arm_of(p, x, k, e) + arm_of(p, x, k + 1, e)), arm_of(p, x, k, e) + 0.5 * dt * slip
-    )
-    u = vector_at(0.5 * (slip + x.load_vel[k + 1, e] - x.vel[k + 1, e]), slip)
+    begin = arm_of(p, x, k, e)
+    arm = vector_at(0.5 * (begin + arm_of(p, x, after, e)), begin + 0.5 * dt * slip)
+    u = vector_at(0.5 * (slip + x.load_vel[after, e] - x.vel[after, e]), slip)
     n = wp.normalize(arm)
     along = wp.dot(n, u)
     swing = (wp.dot(u, u) - along * along) / wp.length(arm)
     reduced = mass * load_mass / (mass + load_mass)
     rod = reduced * (p.tension[1] * swing - p.tension[0] / mass * wp.dot(n, f))
-    load_gain = (x.load_vel[k + 1, e] - load_vel) / dt + GRAVITY * up
+    load_gain = (x.load_vel[after, e] - load_vel) / dt + GRAVITY * up
     pull = number_at(-load_mass * wp.dot(n, load_gain), rod)
     tension = wp.where(pull > TAUT * GRAVITY * load_mass, pull, 0.0) * n
     vel_next = vel + dt / mass * (f + tension)
     load_vel_next = load_vel - dt / load_mass * tension
-    made.pos[k + 1, e] = p.decay * (x.pos[k, e] + 0.5 * dt * (vel + vel_next))
-    made.vel[k + 1, e] = p.decay * vel_next
-    made.quat[k + 1, e] = p.decay * rot_next
-    made.load_pos[k + 1, e] = p.decay * (x.load_pos[k, e] + 0.5 * dt * (load_vel + load_vel_next))
-    made.load_vel[k + 1, e] = p.decay * load_vel_next
-    made.response[k + 1, e] = p.decay * y
+    made.pos[after, e] = decay * (x.pos[k, e] + 0.5 * dt * (vel + vel_next))
+    made.vel[after, e] = decay * vel_next
+    made.quat[after, e] = decay * rot_next
+    made.load_pos[after, e] = decay * (x.load_pos[k, e] + 0.5 * dt * (load_vel + load_vel_next))
+    made.load_vel[after, e] = decay * load_vel_next
+    made.response[after, e] = decay * y
 
 
 @wp.func

@@ -72,15 +72,16 @@ class FirstOrder(Algorithm):
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         self.experiment = experiment
         self.p = experiment.first_order
+        horizon = self.p.horizon
         self._ranks = ranks
         p = experiment.ppo
         _require_supported(experiment)
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag = int(lag + 1e-6)
         remainder = max(lag - self.lag, 0.0)
-        if self.p.horizon < self.lag + NODES[-1]:
+        if horizon < self.lag + NODES[-1]:
             raise ConfigError(
-                f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2}"
+                f"first_order.horizon is {horizon} steps; expected at least {self.lag + 2}"
                 " for a release"
             )
         self._shares = [
@@ -89,7 +90,7 @@ class FirstOrder(Algorithm):
         without_critic = dataclasses.replace(p, privileged=())
         simulated = dataclasses.replace(experiment, ppo=without_critic)
         self.env = env = ThrowEnv(simulated, device, seed)
-        self.samples = env.num_envs * self.p.horizon * ranks.world
+        self.samples = env.num_envs * horizon * ranks.world
         self.network = Network(
             env.get_observations(),
             {"actor": ["actor"]},
@@ -99,7 +100,7 @@ class FirstOrder(Algorithm):
             activation=p.activation,
             obs_normalization=p.normalize,
         ).to(device)
-        self.flights = FlightBatch(env, self.p.horizon)
+        self.flights = FlightBatch(env, horizon)
         with torch.no_grad():
             self.surrogate = fit(self.flights)
             # random commands give every observation a spread to start from
@@ -232,13 +233,14 @@ class FirstOrder(Algorithm):
         lag = self.lag
         k = torch.arange(T, device=steps.device)[:, None]
         K = T - lag - 1  # the cubic looks a step past the separation
+        released = k[:K]
         reward, error, fall = self._rewards_at_release(x, K)
         latch_input = x.action[:K, :, act.COMMANDS] - self.experiment.release.threshold
         smooth = torch.sigmoid(latch_input / self._width)
-        cut = k[:K] + lag + 2 > steps
+        cut = released + lag + 2 > steps
         # the slope stays that of the smooth one
         hazard = smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
-        hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
+        hazard = torch.where(released > steps, 1.0, hazard * (released >= self._first))
         reward = torch.where(cut, -p.termination, reward)
         for shift in (1, -1) * REACH:  # first and last steps meet, where nothing is released
             reward = 0.5 * (reward + reward.roll(shift, 0))
@@ -252,7 +254,7 @@ class FirstOrder(Algorithm):
         gain = releasing + carrying - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        carry = (k[:K] + 1) * self.experiment.sim.control_period
+        carry = (released + 1) * self.experiment.sim.control_period
         duration = carry + self.experiment.release.lag + fall
         share = done / done.sum().clamp(min=1e-6)
         figures = {

@@ -197,21 +197,22 @@ def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Ten
     mass = flights.mass
     load_mass = flights.load_mass
     k = torch.arange(max(lags - 1, 1), len(f["pos"]) - 1, device=mass.device)
+    after = k + 1
     rot = ob.rotation_from_quat(f["quat"])
     y = f["response"]
     lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
-    thrusts = y[k, :, :1] + y[k + 1, :, :1]
+    thrusts = y[k, :, :1] + y[after, :, :1]
     axes = rot[k].unbind(-1)
-    thrust_w = 0.25 * thrusts * (axes[2] + rot[k + 1, :, :, 2])
+    thrust_w = 0.25 * thrusts * (axes[2] + rot[after, :, :, 2])
     vel = f["vel"][k]
     drag = [-axis * (axis * vel).sum(-1, keepdim=True) for axis in axes]
     gravity = torch.tensor([0.0, 0.0, GRAVITY], device=mass.device)
-    load_gain = (f["load_vel"][k + 1] - f["load_vel"][k]) / period
+    load_gain = (f["load_vel"][after] - f["load_vel"][k]) / period
     load_force = load_mass[:, None] * (load_gain + gravity)
-    gain = (f["vel"][k + 1] - vel) / period
+    gain = (f["vel"][after] - vel) / period
     momentum = mass[:, None] * (gain + gravity) + load_force
     arm = f["load_pos"] - f["pos"] - (rot @ flights.mount[:, :, None]).squeeze(-1)
-    arm, u = (0.5 * (path[k] + path[k + 1]) for path in (arm, f["load_vel"] - f["vel"]))
+    arm, u = (0.5 * (path[k] + path[after]) for path in (arm, f["load_vel"] - f["vel"]))
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
     tension = -(n * load_force).sum(-1)
@@ -219,7 +220,7 @@ def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Ten
     along = (n * u).sum(-1, keepdim=True) * n
     swing = (u - along).square().sum(-1) / length
     rows = {
-        "next": y[k + 1],
+        "next": y[after],
         "lagged": torch.stack(lagged, -2),
         "push": torch.stack([thrust_w, *drag], -1),
         "momentum": momentum,
