@@ -284,16 +284,15 @@ def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -
         "env_steps": steps,
         "seconds": trainer.seconds,
     }
-    if "trained" in throws:
-        figures["throws_under_faults"] = [one.summary() for one in throws["trained"]]
+    trained = throws.get("trained", ())
+    if trained:
+        figures["throws_under_faults"] = [one.summary() for one in trained]
     finish(trainer, folder, figures, finished)
     print(f"\n{trainer.iteration} iterations, {steps / 1e6:.1f} M environment steps, {wall:.1f} s")
-    for one in throws["flown"]:
-        print(_line(one))
-    if "trained" in throws:
-        print("under the faults of its training:")
-        for one in throws["trained"]:
-            print(_line(one))
+    lines = [*map(_line, throws["flown"])]
+    if trained:
+        lines += ["under the faults of its training:", *map(_line, trained)]
+    print("\n".join(lines))
     whole = trainer.iteration == trainer.algorithm.iterations
     if whole and not args.overrides and not args.start:
         _compare(args.config, rows)

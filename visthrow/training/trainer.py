@@ -21,10 +21,14 @@ from visthrow.task.measurement import TARGETS, Throws, as_flown
 from visthrow.training import protocol
 from visthrow.training.distillation import Distillation
 from visthrow.training.first_order.first_order_training import FirstOrder
-from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 
+ALGORITHMS = {
+    "ppo": PPOTraining,
+    "first_order": FirstOrder,
+    "distillation": Distillation,
+}
 CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
 SUMMARY = "summary.json"
@@ -61,12 +65,6 @@ def coarsen(experiment: Experiment) -> Experiment:
     rope = dataclasses.replace(rope, segments=segments)
     sim = dataclasses.replace(sim, substep=max(p.substep, sim.substep))
     return dataclasses.replace(experiment, rope=rope, sim=sim)
-
-
-def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algorithm:
-    """Algorithm that the experiment names."""
-    algorithms = {"ppo": PPOTraining, "first_order": FirstOrder, "distillation": Distillation}
-    return algorithms[experiment.algorithm](experiment, device, seed, ranks)
 
 
 def fitted(experiment: Experiment, policy: Policy) -> Experiment:
@@ -109,14 +107,16 @@ class Trainer:
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks | None = None):
         """Build the algorithm; the seed is that of everything random."""
         ranks = ranks or Ranks(device)
-        torch.manual_seed(seed * 1000 + ranks.rank)
+        seed_of_rank = seed * 1000 + ranks.rank
+        torch.manual_seed(seed_of_rank)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)  # captures and synchronisation go to the current device
         self.experiment = experiment
         self.device = device
         self.seed = seed
         self.ranks = ranks
-        self.algorithm = build(coarsen(experiment), device, seed * 1000 + ranks.rank, ranks)
+        algorithm = ALGORITHMS[experiment.algorithm]
+        self.algorithm = algorithm(coarsen(experiment), device, seed_of_rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 

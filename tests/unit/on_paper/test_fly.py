@@ -156,4 +156,3 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, one_start):
 
 def test_the_command_refuses_what_it_cannot_fly(tmp_path, refused):
     refused(f"baseline --plants hybird --out {tmp_path}", message="did you mean 'hybrid'")
-    refused("baseline --throws 0", message="a whole number of 1 or more")

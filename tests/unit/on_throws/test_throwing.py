@@ -409,11 +409,7 @@ def test_table_says_success_rate_and_leaves_failures_blank():
             "fly --policy DROPPER --set release.lag=0.2",
             "release.lag: trained with 0.11, here 0.2",
         ),
-        ("compare DROPPER --throws 0", "--throws 0"),
-        ("compare DROPPER --targets 9", "from 0 to 3 m"),
         ("compare DROPPER --targets 1 1", "twice"),
-        ("compare DROPPER --targets 3.01", "from 0 to 3 m"),
-        ("compare DROPPER --targets -0.01", "from 0 to 3 m"),
         ("compare DROPPER --plant real", "no plant 'real'"),
         (
             "compare DROPPER --calibrate --plant reference --throws 1",

@@ -65,7 +65,8 @@ class PoseDelay:
 
     def push(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Take the current pose sample; return the delayed one, linear between control steps."""
-        self.poses.copy_(arrays.push(self.poses, pose, fresh))
+        poses = self.poses
+        poses.copy_(arrays.push(poses, pose, fresh))
         if self._params.oldest == 0.0:
             return pose
         age = self.age
@@ -74,10 +75,10 @@ class PoseDelay:
             sample = 2.0 * torch.rand_like(age) - 1.0
             age = age + jitter * sample / self._unit
         age = age / self._period
-        whole = age.floor().clamp(max=self.poses.shape[1] - 2.0)
+        whole = age.floor().clamp(max=poses.shape[1] - 2.0)
         row = whole.long()[:, None, None].expand(-1, 1, POSE)
-        newer = self.poses.gather(1, row)[:, 0]
-        older = self.poses.gather(1, row + 1)[:, 0]
+        newer = poses.gather(1, row)[:, 0]
+        older = poses.gather(1, row + 1)[:, 0]
         return newer + (older - newer) * (age - whole)[:, None]
 
     def exact(self, age: float) -> Tensor:

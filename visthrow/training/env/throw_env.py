@@ -247,6 +247,7 @@ class ThrowEnv(ThrowEpisodes):
         """Actor's and critic's view of the current state."""
         state = self.views.state
         buffers = self.buffers
+        layout = self.layout
         payload = self.views.out["payload_pos_w"]
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
@@ -257,7 +258,7 @@ class ThrowEnv(ThrowEpisodes):
         true_frame = self._state_frame(pose, late_goal)
         measured = self._measure(true_frame)
         valid = None
-        if self.layout.name == "vision":
+        if layout.name == "vision":
             if self.cfg.task.observation.oldest > 0.0:
                 rot_wb = ob.rotation_in(pose)
             payload_w = pose[:, ob.VEHICLE :]
@@ -268,18 +269,18 @@ class ThrowEnv(ThrowEpisodes):
         time = self.episode_length_buf.float() * self.cfg.sim.control_period
         goal_vel = places = answers = None
         setup = self._fleet.observed if self._fleet else None
-        if self.layout.fits:
+        if layout.fits:
             fitted = goal_motion.update_goal_fit(
-                self.layout, measured, valid, self.view.camera, buffers["goal_fit"], time, fresh
+                layout, measured, valid, self.view.camera, buffers["goal_fit"], time, fresh
             )
             buffers["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
-        if self.layout.response:
+        if layout.response:
             answer = ob.answer(measured, self.previous_action)
             buffers["answers"].copy_(arrays.push(buffers["answers"], answer, fresh))
             answers = buffers["answers"][:, 1:]
         actor, history = ob.observe(
-            self.layout,
+            layout,
             measured,
             valid,
             self.previous_action,

@@ -146,6 +146,7 @@ class FirstOrder(Algorithm):
         """Return the policy's actions, on a CPU of each flight until nothing that follows has a
         derivative: its latch asked twice.
         """
+        flying = self.flights.flying
         if k == 0:
             self._requests.zero_()
         stops = self._latched == 1.0 and self.env.device == "cpu"
@@ -154,9 +155,9 @@ class FirstOrder(Algorithm):
         if stops and before >= self._first:
             asked = self.layers.action[before, :, act.COMMANDS] > self.experiment.release.threshold
             self._requests.add_(asked)
-            torch.lt(self._requests, 2, out=self.flights.flying)
-        if not stops or self.flights.flying.any():
-            return self.layers.forward(k, obs, self.flights.flying)
+            torch.lt(self._requests, 2, out=flying)
+        if not stops or flying.any():
+            return self.layers.forward(k, obs, flying)
         return None
 
     def _rewards_at_release(self, x: SimpleNamespace, count: int) -> tuple[Tensor, Tensor, Tensor]:

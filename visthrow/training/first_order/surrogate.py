@@ -70,15 +70,16 @@ class FlightBatch:
     def __init__(self, env: ThrowEnv, steps: int):
         E = env.num_envs
         make = {"device": env.device}
+        times = steps + 1
         self.env = env
         self.last = steps
         self.course = Course()
         self.made = Course()
         self.adjoint = {}
-        self.x = {"command": torch.zeros(steps + 1, E, actions.COMMANDS, **make)}
+        self.x = {"command": torch.zeros(times, E, actions.COMMANDS, **make)}
         for name in STATES:
             dtype = Course.vars[name].type.dtype
-            states, unused = (wp.zeros((steps + 1, E), dtype, env.device) for _ in range(2))
+            states, unused = (wp.zeros((times, E), dtype, env.device) for _ in range(2))
             states.requires_grad = True
             unused.grad = states.grad
             setattr(self.course, name, states)
@@ -86,9 +87,9 @@ class FlightBatch:
             self.x[name] = wp.to_torch(states, requires_grad=False)
             self.adjoint[name] = wp.to_torch(states.grad)
         self.obs = torch.zeros(steps, E, env.layout.dimension, **make)
-        self.landing = torch.zeros(steps + 1, E, 2, **make)
-        self.time = torch.zeros(steps + 1, E, **make)
-        self.failed = torch.zeros(steps + 1, E, dtype=torch.bool, **make)
+        self.landing = torch.zeros(times, E, 2, **make)
+        self.time = torch.zeros(times, E, **make)
+        self.failed = torch.zeros(times, E, dtype=torch.bool, **make)
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
         self._mask = wp.from_torch(self.flying)
         (vehicle, rope) = env.sim.plants()
@@ -115,8 +116,9 @@ class FlightBatch:
         """
         env = self.env
         x = self.x
-        state = env.views.state
-        out = env.views.out
+        views = env.views
+        state = views.state
+        out = views.out
         sources = {
             "pos": state["pos_w"],
             "vel": state["vel_w"],
@@ -136,8 +138,8 @@ class FlightBatch:
             x["response"][k, :, 0] = self._thrust * state["motor_speed"].square().sum(-1)
             x["response"][k, :, 1:] = state["rate_b"]
             self.failed[k] = env.failed()
-            self.landing[k] = env.views.foreseen["landing_w"][:, :2]
-            self.time[k] = env.views.foreseen["time_to_impact"]
+            self.landing[k] = views.foreseen["landing_w"][:, :2]
+            self.time[k] = views.foreseen["time_to_impact"]
             self.last = k
             if k == len(self.obs):
                 break
@@ -146,7 +148,7 @@ class FlightBatch:
                 break
             self.steps.add_(self.flying)
             observation = env.carry(action, self._mask)["actor"]
-            x["command"][k] = env.views.command
+            x["command"][k] = views.command
         self.steps.clamp_(max=(~self.failed[1:]).int().cumprod(0).sum(0))
 
 

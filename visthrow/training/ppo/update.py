@@ -20,19 +20,20 @@ class CapturedPPO(PPO):
     def __init__(self, actor: Network, critic: Network, storage, muon: bool = False, **settings):
         """Take rsl_rl's settings; ``muon``: see :class:`PPOParams`."""
         super().__init__(actor, critic, storage, **settings)
-        self._cuda = torch.device(self.device).type == "cuda"
+        device = self.device
+        self._cuda = torch.device(device).type == "cuda"
         self._parameters = [*actor.parameters(), *critic.parameters()]
-        self.rate = torch.tensor([self.learning_rate], device=self.device)
-        self.target_kl = torch.tensor([self.desired_kl], device=self.device)
+        self.rate = torch.tensor([self.learning_rate], device=device)
+        self.target_kl = torch.tensor([self.desired_kl], device=device)
         # 0 holds the actor still, to the bit, while the critic learns
-        self.actor_learns = torch.ones(1, device=self.device)
+        self.actor_learns = torch.ones(1, device=device)
         options = {"lr": self.rate, "fused": True, "capturable": self._cuda}
         if muon:
             matrices = actor.matrices + critic.matrices
             self.optimizer = MuonAdam(self._parameters, matrices, **options)
         else:
             self.optimizer = torch.optim.Adam(self._parameters, **options)
-        self._totals = torch.zeros(3, device=self.device)
+        self._totals = torch.zeros(3, device=device)
         self._capture()
 
     def _capture(self) -> None:
