@@ -181,7 +181,6 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
 @mark.parametrize(
     ("extra", "message"),
     [
-        (["--iterations", "-3"], "--iterations -3"),
         (["--until", "4"], "--until 4 m; throws are at 2 m"),  # centimetres
         (["--set", "vehicle.body.mass=-1"], "mass"),
         (["--set", "rope.length=-0.2"], "length"),

@@ -77,18 +77,18 @@ class PPOTraining(Algorithm):
         self.device = device
         self.iterations = p.iterations
         self.samples = p.environments * p.steps * ranks.world
-        self.env = build(experiment, device, seed)
+        self.env = env = build(experiment, device, seed)
         with contextlib.redirect_stdout(io.StringIO()):
             self.alg: CapturedPPO = PPO.construct_algorithm(
-                self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
+                env.get_observations(), env, rsl_rl_config(p, ranks), device
             )
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
         self.network = self.alg.actor
         self.average = average_weights(self.network, AVERAGED)
-        self._obs = self.env.get_observations()
+        self._obs = env.get_observations()
         # a solver whose work cannot be captured is launched
-        capturable = device.startswith("cuda") and self.env.sim.capturable
+        capturable = device.startswith("cuda") and env.sim.capturable
         self.rollout = ReplayedGraph(self._rollout) if capturable else self._rollout
 
     def _rollout(self) -> None:
