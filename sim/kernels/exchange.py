@@ -132,8 +132,8 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int):
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
         s = load_bodies(state, env, parts.load(state, env), n, u)
         pos, vel = parts.coupled.payload(rope_of(plants, env), s, n, u)
         store_bodies(bodies, env, s, n, u, pos, vel)
@@ -239,9 +239,9 @@ def build_exchange(
         p = vehicle_of(plants, state, env)
         rope = rope_of(plants, env)
         half = real(0.5) * h
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        stiffness = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        stiffness = wp.zeros(L, real)
         parts.load_rope(state, env, n, u, stiffness)
         whole, switch = split_delay(p, plants.control_period)
         active, _until = command_at(
@@ -302,8 +302,8 @@ def build_exchange(
             return
         pos = bodies.payload_pos_w[env]
         vel = bodies.payload_vel_w[env]
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
         s = load_bodies(bodies, env, load(state, env), n, u)
         size = st.size(s) + parts.rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
@@ -369,7 +369,7 @@ def build_exchange(
             )
         if state.attached[env] != 0:
             s = load(state, env)
-            n = wp.zeros(shape=(L,), dtype=vec3)
+            n = wp.zeros(L, vec3)
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
             p = vehicle_of(plants, state, env)

@@ -229,9 +229,9 @@ def build_step(
         air = air_of(plants, state, env)
         period = plants.control_period
         gravity = plants.gravity
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        stiffness = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        stiffness = wp.zeros(L, real)
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, zero)
         s = load(state, env)
@@ -319,9 +319,9 @@ def build_step(
         env = wp.tid() + first
         natural = rope_of(plants, env)
         s = load(state, env)
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        stiffness = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        stiffness = wp.zeros(L, real)
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, zero)
         if state.attached[env] != 0:
@@ -341,9 +341,9 @@ def build_step(
     ):
         env = first + wp.tid()
         natural = rope_of(plants, env)
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        stiffness = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        stiffness = wp.zeros(L, real)
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, zero)
         s = load(state, env)

@@ -81,9 +81,9 @@ def _kernel(world: World) -> wp.Kernel:
         air.push_w = wrench.force_b[env]
         air.twist_b = wrench.torque_b[env]
         air.payload_push_w = wrench.load_w[env]
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        k = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        k = wp.zeros(L, real)
         s = load_bodies(bodies, env, QuadState(), n, u)
         for i in range(L):
             k[i] = state.stiffness[i, env]

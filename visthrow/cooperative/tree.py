@@ -143,14 +143,14 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
         half = real(0.5) * h
         first = world * V
         load_mass = real(0.0)
-        n = wp.zeros(shape=(N,), dtype=vec3)  # in the middle
-        u = wp.zeros(shape=(N,), dtype=vec3)
-        swing = wp.zeros(shape=(N,), dtype=vec3)  # second derivative of n
-        c1 = wp.zeros(shape=(N,), dtype=vec3)
-        c2 = wp.zeros(shape=(N,), dtype=vec3)
-        h1 = wp.zeros(shape=(N,), dtype=real)
-        h2 = wp.zeros(shape=(N,), dtype=real)
-        turn = wp.zeros(shape=(V,), dtype=vec3)  # angular acceleration, body frame
+        n = wp.zeros(N, vec3)  # in the middle
+        u = wp.zeros(N, vec3)
+        swing = wp.zeros(N, vec3)  # second derivative of n
+        c1 = wp.zeros(N, vec3)
+        c2 = wp.zeros(N, vec3)
+        h1 = wp.zeros(N, real)
+        h2 = wp.zeros(N, real)
+        turn = wp.zeros(V, vec3)  # angular acceleration, body frame
         for k in range(V):
             row = first + k
             load_mass += ropes[row % ropes.shape[0]].payload_mass

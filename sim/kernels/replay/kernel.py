@@ -408,9 +408,9 @@ def build_replay(
         air = plants.airs[row]
         gravity = plants.gravity
         g = plants.gravity_w
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        stiffness = wp.zeros(shape=(L,), dtype=real)
+        n = wp.zeros(L, vec3)
+        u = wp.zeros(L, vec3)
+        stiffness = wp.zeros(L, real)
         m = begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
         resume = lanes.resume[lane]
         if resume >= 0:

@@ -138,11 +138,11 @@ def build_coupled_step(
         max_turn: real,
         h: real,
     ):
-        k1 = wp.zeros(shape=(L,), dtype=vec3)
-        n2 = wp.zeros(shape=(L,), dtype=vec3)
-        c1 = wp.zeros(shape=(L,), dtype=vec3)
-        c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=vec2)
+        k1 = wp.zeros(L, vec3)
+        n2 = wp.zeros(L, vec3)
+        c1 = wp.zeros(L, vec3)
+        c2 = wp.zeros(L, vec3)
+        hs = wp.zeros(L, vec2)
         half = real(0.5)
         weight = (p.body.mass + rope.total_mass) * gravity
 

@@ -44,11 +44,11 @@ def build_loose_step(t: Types, chain):
         max_turn: real,
         h: real,
     ):
-        k1 = wp.zeros(shape=(L,), dtype=vec3)
-        n2 = wp.zeros(shape=(L,), dtype=vec3)
-        c1 = wp.zeros(shape=(L,), dtype=vec3)
-        c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=vec2)
+        k1 = wp.zeros(L, vec3)
+        n2 = wp.zeros(L, vec3)
+        c1 = wp.zeros(L, vec3)
+        c2 = wp.zeros(L, vec3)
+        hs = wp.zeros(L, vec2)
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
         load1 = free_force(rope, air, chain.speed(rope, vel_w, u, k1, h))
