@@ -58,9 +58,9 @@ class Landing:
     landing_w: Vector  # payload's centre [m]
     error: float  # horizontal distance from the goal [m]
     duration: float  # from the throw's start to the landing [s]
-    lag: float = 0.0  # trained, from latch to separation [s]
-    separation: float | None = None  # by the poses [s]; None where they do not show it
-    separation_w: Vector | None = None  # payload's centre at that time [m]
+    lag: float  # trained, from latch to separation [s]
+    separation: float | None  # by the poses [s]; None where they do not show it
+    separation_w: Vector | None  # payload's centre at that time [m]
 
 
 @dataclass
@@ -71,7 +71,7 @@ class PayloadFlight:
     start: float  # of the throw [s]
     latch: float  # of the release [s]
     height: float  # of the payload's centre as it lands [m]
-    lag: float = 0.0  # from latch to separation [s]
+    lag: float  # from latch to separation [s]
     _times: list[float] = field(default_factory=list)
     _points: list[Vector] = field(default_factory=list)
 

@@ -125,7 +125,7 @@ class Response:
         change = self._shares * (np.array(self._commands) - self._responses)
         self._responses = self._responses + change
 
-    def pause(self, rates: tuple[float, ...] | None = None) -> None:
+    def pause(self, rates: tuple[float, ...] | None) -> None:
         """Note a tick in which nothing of ours was followed, and the rates reported then."""
         self._last = None
         if rates is not None and not self._ticks:

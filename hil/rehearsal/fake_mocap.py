@@ -30,7 +30,7 @@ class FakeMocapParams(Bounded):
 class Mocap:
     """Measures vehicle and payload."""
 
-    def __init__(self, params: FakeMocapParams, seed: int = 0):
+    def __init__(self, params: FakeMocapParams, seed: int):
         """Begin with a measurement at time 0; ``seed``: of noise and loss."""
         self.params = params
         self._rng = np.random.default_rng(seed)

@@ -53,9 +53,7 @@ def load_fake(kind: str) -> type[Fake]:
         raise RunError(f"fake of kind '{kind}': {error}; expected module:class") from error
 
 
-def serve(
-    fake: Fake, clock: Clock, limit: float, out: Path | None = None, after: float = AFTER_LANDING
-) -> dict[str, Any]:
+def serve(fake: Fake, clock: Clock, limit: float, out: Path | None, after: float) -> dict[str, Any]:
     """Fly in real time, or on a firmware's clock, until ``after`` seconds after the landing, for
     ``limit`` seconds, or until Ctrl-C; returns the report.
     """

@@ -45,10 +45,10 @@ class StepKernels:
 def build_parts(
     t: Types,
     params: PlantParams,
-    direct: bool = False,
-    extensions: frozenset[str] = frozenset(),
-    motors: bool = False,
-    integrator: str = "heun",
+    direct: bool,
+    extensions: frozenset[str],
+    motors: bool,
+    integrator: str,
 ) -> SimpleNamespace:
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
@@ -154,10 +154,10 @@ def build_parts(
 def build_step(
     t: Types,
     params: PlantParams,
-    direct: bool = False,
-    extensions: frozenset[str] = frozenset(),
-    motors: bool = False,
-    integrator: str = "heun",
+    direct: bool,
+    extensions: frozenset[str],
+    motors: bool,
+    integrator: str,
 ) -> StepKernels:
     """Compose the kernel for the kinds and the number of segments of ``params``.
 

@@ -80,7 +80,7 @@ def vehicle_rates(
     command: ndarray,
     air_velocity_b: ndarray,
     rate_b: ndarray,
-    near_ground: ndarray | float = 1.0,
+    near_ground: ndarray | float,
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Run the seven blocks.
 

@@ -46,8 +46,8 @@ class RopeDynamics:
         self,
         body: BodyParams,
         ropes: list[RopeParams],
-        stretch: tuple[float, float] | None = None,
-        mount_damping: float = 0.0,
+        stretch: tuple[float, float] | None,
+        mount_damping: float,
     ):
         self.segments = ropes[0].segments
         self.count = len(ropes)

@@ -237,8 +237,8 @@ class Fit:
         self,
         params: FitParams,
         camera: CameraParams,
-        device: str = "cpu",
-        files: list[Path] | None = None,
+        device: str,
+        files: list[Path] | None,
     ):
         """Start with untrained networks.
 

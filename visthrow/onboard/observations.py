@@ -59,7 +59,7 @@ class Layout:
     payload: int  # width of the payload's part, once
     history: int  # H
     validity: int  # width of the validity bits
-    motion: int = 0  # width of the goal's velocity
+    motion: int  # width of the goal's velocity
     located: int = 0  # width of where the keypoints lie
     response: int = 0  # earlier steps of the vehicle's response
     setup: int = 0  # width of the vehicle's set-up

@@ -111,7 +111,7 @@ def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
 def training_experiment(
     policy: Policy,
     path: str | Path,
-    overrides: Iterable[str] = (),
+    overrides: Iterable[str],
     kind: type[Kind] = Experiment,  # type: ignore[assignment]
 ) -> Kind:
     """Experiment that a policy was trained in, as its training says that it is flown, with changes;

@@ -16,8 +16,8 @@ CHANNELS = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
 def fly_alone(
     experiment: Experiment,
     target: tuple[float, float],
-    integrator: str = "rk4",
-    device: str = "cpu",
+    integrator: str,
+    device: str,
 ) -> FlightLog:
     """Fly a quadrotor from its hover point to the point above a target, and hover there.
 

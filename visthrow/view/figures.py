@@ -30,7 +30,7 @@ class Mark:
 
     label: str
     interval: Interval
-    series: int = 0  # which colour and marker
+    series: int  # which colour and marker
     paper: Interval | None = None
 
 
@@ -63,7 +63,7 @@ class Trade:
     # series, label, points (N, 2): duration [s], error [m]
     fronts: tuple[tuple[int, str, ndarray], ...]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
-    crosses: tuple[tuple[str, ndarray], ...] = ()  # the paper's
+    crosses: tuple[tuple[str, ndarray], ...]  # the paper's
 
 
 def _look(series: int) -> tuple[str, str]:

@@ -18,7 +18,7 @@ DATA_PORT = 9876
 
 
 @contextmanager
-def web_viewer(layout: Any, web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
+def web_viewer(layout: Any, web_port: int, data_port: int) -> Iterator[Any]:
     """Serve the viewer with one recording and say where; gives the stream that it shows.
 
     DeviceError where a port is taken.

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 DPI = 150.0  # of pictures
 
@@ -91,7 +91,7 @@ class Section:
 
     name: str
     title: str
-    parts: tuple[Text | Grid | Picture, ...] = field(default=())
+    parts: tuple[Text | Grid | Picture, ...]
 
 
 Part = Text | Grid | Picture

@@ -82,7 +82,7 @@ class Crazyflie(OnPort):
     protocol = "CRTP"
     params: CrazyflieParams
 
-    def __init__(self, port: Port, params: CrazyflieParams, tell: Announce = None):
+    def __init__(self, port: Port, params: CrazyflieParams, tell: Announce):
         """Speak CRTP on an open port; ``tell`` is handed the settings and who is refused."""
         super().__init__(port, params, tell)
         self.release_record = Release(params.release_timeout)

@@ -11,7 +11,7 @@ from sim.kernels.quadrotor.rigid_body import angular_acceleration, blend
 from sim.kernels.structs import Types
 
 
-def build_quad_step(t: Types, flow, advance, integrator: str = "heun"):
+def build_quad_step(t: Types, flow, advance, integrator: str):
     """Return ``step(p, air, s, command, gravity, h) -> state`` of one integrator."""
     real = t.real
 

@@ -97,9 +97,7 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
     return out
 
 
-def build_flow(
-    t: Types, vehicle: VehicleParams, extensions: frozenset[str] = frozenset(), motors: bool = False
-):
+def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str], motors: bool):
     """Compose the blocks of a vehicle's kinds.
 
     Args:

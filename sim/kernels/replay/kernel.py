@@ -332,8 +332,8 @@ def build_replay(
     t: Types,
     vehicle: VehicleParams,
     segments: int,
-    laws: tuple[LawParams, ...] = (),
-    imposed: bool = False,
+    laws: tuple[LawParams, ...],
+    imposed: bool,
 ) -> ReplayKernel:
     """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
     numbers are read at run time.

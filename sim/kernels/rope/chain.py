@@ -387,9 +387,7 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
     return down_first, down_second, fall_back
 
 
-def build_chain(
-    t: Types, segments: int, extensions: frozenset[str] = frozenset()
-) -> SimpleNamespace:
+def build_chain(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNamespace:
     """Recursion for a fixed number of segments.
 
     Args:

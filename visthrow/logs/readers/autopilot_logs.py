@@ -203,7 +203,7 @@ def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Cha
     return make_channel(fields["time"], values, entry, source, ~valid_rows(fields, tap.good))
 
 
-def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -> FlightLog:
+def log_of_poses(path: str | Path, kind: str, message: str, instance: int) -> FlightLog:
     """Read the poses of one message of a log of kind "bin" or "ulg", whatever its ending.
 
     The axes stay the autopilot's: world north, east, down (PX4 optionally forward, right, down),

@@ -361,8 +361,8 @@ def fly_plant(
     plant_name: str,
     experiment: Experiment,
     delays: Delays,
-    count: int = 10,
-    seed: int = 0,
+    count: int,
+    seed: int,
     batch: int = 0,
     device: str = "cpu",
 ) -> Flown:

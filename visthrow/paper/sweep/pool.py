@@ -58,7 +58,7 @@ class Local:
     out: Path
     devices: list[str]
     jobs: int
-    changes: Changes = ()
+    changes: Changes
 
     def start(self, task: Task, device: str, minutes: float) -> Process:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}

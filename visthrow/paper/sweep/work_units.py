@@ -253,7 +253,7 @@ def _hash(path: Path, changed: int) -> str:
 
 
 @cache
-def _shipped_config(path: Path, changes: Changes = ()) -> dict[str, Any]:
+def _shipped_config(path: Path, changes: Changes) -> dict[str, Any]:
     from visthrow.throws.loading import load_policy
 
     return config.to_dict(load_policy(path, None, changes, allow=_ANYTHING).experiment)
