@@ -262,22 +262,23 @@ class VehicleParams(BoundedFields):
 
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
+        mass = self.body.mass
         super().__post_init__()
         c = self.controller
         rotors = self.rotors
         if self.motor.kind == "asymmetric" and not self.motor.time_constant_down:
             raise ValueError("motor.time_constant_down is 0.0; expected above 0")
-        if 4.0 * c.max_thrust <= self.body.mass * GRAVITY:
+        if 4.0 * c.max_thrust <= mass * GRAVITY:
             raise ValueError(
                 f"controller.max_thrust is {c.max_thrust:g} N a motor; expected more than a quarter"
-                f" of the vehicle's weight, {self.body.mass * GRAVITY / 4.0:.3g} N"
+                f" of the vehicle's weight, {mass * GRAVITY / 4.0:.3g} N"
             )
         reach = max(map(math.hypot, rotors.x, rotors.y)) + rotors.radius
         for inertia in self.body.inertia:
-            gyration = math.sqrt(inertia / self.body.mass)
+            gyration = math.sqrt(inertia / mass)
             if not LEAST_GYRATION * reach <= gyration <= reach:
                 raise ValueError(
-                    f"body.inertia {inertia:g} kg m^2 puts {self.body.mass:g} kg {gyration:.3g} m"
+                    f"body.inertia {inertia:g} kg m^2 puts {mass:g} kg {gyration:.3g} m"
                     f" from its middle; expected {LEAST_GYRATION * reach:.3g} m to"
                     f" {reach:.3g} m, where the rotors end"
                 )

@@ -104,10 +104,11 @@ class Link:
 
     def _take(self, data: bytes, arrival: float) -> int:
         """Hand on the messages in a chunk that are of our parties; returns their number."""
+        parser = self.parser
         count = 0
-        errors = self.parser.errors
-        messages = self.parser.parse(data, self.port.whole)
-        if self.parser.errors > errors and not self.parser.forged:
+        errors = parser.errors
+        messages = parser.parse(data, self.port.whole)
+        if parser.errors > errors and not parser.forged:
             self.roster.drop(self.sender, "bytes", "no MAVLink message")
         for message in messages:
             if not self.roster.admit(message, self.sender, arrival):
@@ -117,7 +118,7 @@ class Link:
             for listener in self._listeners:
                 listener(message, arrival)
             count += 1
-        for forged in self.parser.forged:
+        for forged in parser.forged:
             ids = forged[IDS[forged[0]]]
             self.roster.refuse(Traffic(self.sender, *ids, "message", "no valid signature"))
         return count

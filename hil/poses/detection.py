@@ -102,17 +102,18 @@ class Detections:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
         at a tick [s].
         """
+        stamp = detection.stamp
         frame = detection.frame_detections()
         rot_wb = matrix_of_quat(np.array(quat))
         if self._turn is not None and self._path:
-            frame = self._carry(frame, detection.stamp - self._latency + aged)
+            frame = self._carry(frame, stamp - self._latency + aged)
         points, valid = convert_to_training_keypoints(self._camera, frame, rot_wb)
-        self.fresh = detection.stamp, points.numpy(), valid.numpy()
-        if detection.stamp <= self._newest:
+        self.fresh = stamp, points.numpy(), valid.numpy()
+        if stamp <= self._newest:
             return
-        self._newest = detection.stamp
+        self._newest = stamp
         for name, part in PARTS.items():
-            self._times[name] = -np.inf if getattr(frame, name) is None else detection.stamp
+            self._times[name] = -np.inf if getattr(frame, name) is None else stamp
             if getattr(frame, name) is not None:
                 self._points[part] = points[part]
                 self._valid[part] = valid[part]

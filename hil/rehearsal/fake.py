@@ -390,35 +390,32 @@ class Fake(ABC):
 
     def fly(self) -> None:
         """Hear what has come, and fly one period."""
+        plant = self.plant
         self.hear()
-        self.deliver(self.plant.time)
-        if not self.taken and self.plant.time >= self.options.taken_after:
+        self.deliver(plant.time)
+        if not self.taken and plant.time >= self.options.taken_after:
             self.taken = True
             self.take()
-        self._target = self._set_points.flown(self.plant.time, self.plant.period)
+        self._target = self._set_points.flown(plant.time, plant.period)
         command = self.flown()
         self.last_thrust = command[0]
-        after = 0.0 if self._trip is None else self._trip - self.plant.time
-        opens = self._trip is not None and after < self.plant.period - SLACK
-        self.plant.step(command, opens, max(after, 0.0) if opens else 0.0)
+        after = 0.0 if self._trip is None else self._trip - plant.time
+        opens = self._trip is not None and after < plant.period - SLACK
+        plant.step(command, opens, max(after, 0.0) if opens else 0.0)
 
     def emit(self) -> None:
         """Measure and send what is due now."""
-        if self.mocap.due(self.plant.time):
-            written = [
-                self._to_source(pose)
-                for pose in self.mocap.measure(self.plant.time, self.plant.state)
-            ]
-            for pose in self.spoil(written, self.plant.time):
+        time = self.plant.time
+        if self.mocap.due(time):
+            written = [self._to_source(pose) for pose in self.mocap.measure(time, self.plant.state)]
+            for pose in self.spoil(written, time):
                 self._post(pose)
-        if self.plant.time - self._announced >= ANNOUNCED:
-            self._announced = self.plant.time
+        if time - self._announced >= ANNOUNCED:
+            self._announced = time
             self.link.send(
-                mav.MAVLink_named_value_int_message(
-                    int(1e3 * self.plant.time), SIMULATED.encode(), 1
-                )
+                mav.MAVLink_named_value_int_message(int(1e3 * time), SIMULATED.encode(), 1)
             )
-        self.deliver(self.plant.time)
+        self.deliver(time)
         if not self.silent:
             self.speak()
 

@@ -55,15 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly a fake autopilot, or a bridge to a firmware in software, and print its report."""
+    kind_name = args.kind
     out = None if args.out is None else Path(args.out)
     options = config.loads(
         FakeOptions, "", [*args.overrides, f"answer={args.answer}"], "options of the fake"
     )
     mocap = FakeMocapParams(rate=args.rate)
     kinds = {*FAKES, *SITL}
-    if ":" not in args.kind and args.kind not in kinds:
-        raise RunError(f"--kind {args.kind}; {suggest(args.kind, kinds)}, or module:class")
-    maker = args.plant or SITL.get(args.kind, PLANT)
+    if ":" not in kind_name and kind_name not in kinds:
+        raise RunError(f"--kind {kind_name}; {suggest(kind_name, kinds)}, or module:class")
+    maker = args.plant or SITL.get(kind_name, PLANT)
     plant = load_plant(maker, args.policy, args.seed, args.changes)
     if out is not None:
         writable(out.parent)
@@ -74,16 +75,16 @@ def run(args: argparse.Namespace) -> int:
     )
     with ExitStack() as ends:
         vehicle = plant, link, mocap, args.seed, options
-        if args.kind in SITL:
+        if kind_name in SITL:
             flown = _bridge(args, vehicle, ends)
         else:
-            kind = load_fake(args.kind)
+            kind = load_fake(kind_name)
             flown = kind(*vehicle, kind.open_port(args.msp_port))
-            print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
+            print(f"the fake {kind_name} flies", file=sys.stderr, flush=True)
         ends.callback(flown.close)
         report = serve(flown, MonotonicClock(args.speed), args.seconds, out, args.after)
     late = report["late_periods"] * plant.period / report["time"]
-    if args.kind in SITL and max(late, 1.0 - report.get("speed", 1.0)) > SLOW:
+    if kind_name in SITL and max(late, 1.0 - report.get("speed", 1.0)) > SLOW:
         print(
             f"this machine is too slow: {100 * late:.0f} % of the periods were late, the firmware's"
             f" clock went at {report.get('speed', 1.0):.2f} of this one's; slow all clocks,"

@@ -376,27 +376,29 @@ class ReferencePlant:
                 delay of the queue.
             release: latch the release now, shape (E,), bool; a latch does not untrip.
         """
+        count = self.count
+        params = self.params
         extras = self.extras
         rng = self._rng
-        period = self.params.sim.control_period
+        period = params.sim.control_period
         start = self.time
         end = self.time + period
-        jitter = extras.delay_jitter * rng.uniform(-1.0, 1.0, self.count)
-        acts = start + np.maximum(self.params.vehicle.queue.delay + jitter, 0.0)
+        jitter = extras.delay_jitter * rng.uniform(-1.0, 1.0, count)
+        acts = start + np.maximum(params.vehicle.queue.delay + jitter, 0.0)
         self._queue_times.append(np.maximum(acts, self._queue_times[-1]))
-        commands = np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4))
+        commands = np.broadcast_to(np.asarray(command, dtype=np.float64), (count, 4))
         self._queue_commands.append(commands.copy())
-        lag = self.params.release.lag
-        if self.params.release.lag_tension:
-            lag = vehicle_blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
-        lag = lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
-        tripped = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,)) & ~self._latched
+        lag = params.release.lag
+        if params.release.lag_tension:
+            lag = vehicle_blocks.release_lag(params.release, self._pull(), self._payload_mass)
+        lag = lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, count)
+        tripped = np.broadcast_to(np.asarray(release, dtype=bool), (count,)) & ~self._latched
         self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
         mean = self._mean_wind
         sigma = np.sqrt(1 - decay**2) * np.array(extras.wind_sigma_w)
-        gust = sigma * rng.standard_normal((self.count, 3))
+        gust = sigma * rng.standard_normal((count, 3))
         self._next_wind = mean + decay * (self._wind - mean) + gust
         self._advance(end)
         self._wind = self._next_wind

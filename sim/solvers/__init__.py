@@ -125,16 +125,17 @@ class Exchange:
 
     def step(self, launch: Callable[..., None], sim: Any) -> None:
         """Advance by one control period."""
-        h = self.world.substep
-        k = self.world.kernels
-        plants = self.world.plants
+        world = self.world
+        h = world.substep
+        k = world.kernels
+        plants = world.plants
         flags = self._flags
         launch(k.begin, [plants, sim.state, sim.inputs, flags, sim.out])
-        for i in range(self.world.substeps):
-            wrench = [sim.state, flags, sim.out, self.world.wrench]
+        for i in range(world.substeps):
+            wrench = [sim.state, flags, sim.out, world.wrench]
             launch(k.wrench, [plants, i * h, h, *wrench])
             self.solver.advance(h)
-            taken = [sim.state, flags, self.world.wrench, self.world.bodies, sim.out]
+            taken = [sim.state, flags, world.wrench, world.bodies, sim.out]
             launch(k.take, [plants, (i + 1) * h, h, *taken])
         launch(k.end, [plants, sim.state, sim.inputs, sim.out])
         self.place(launch, sim, flags.redrawn)

@@ -72,6 +72,7 @@ add_arguments = declare(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
+    plant = args.plant
     if args.runs:
         return _compare_runs(args)
     check(args.targets)
@@ -82,10 +83,10 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import check_plant
 
-    check_plant(args.plant)
-    if args.calibrate and args.plant != "hybrid":
+    check_plant(plant)
+    if args.calibrate and plant != "hybrid":
         raise ConfigError(
-            f"--calibrate on plant '{args.plant}'; expected 'hybrid', whose cameras differ from"
+            f"--calibrate on plant '{plant}'; expected 'hybrid', whose cameras differ from"
             " throw to throw"
         )
     names = args.policies or DEFAULT_POLICIES
@@ -101,14 +102,14 @@ def run(args: argparse.Namespace) -> int:
         )
     if not loaded:
         throws = []
-    elif args.plant == "hybrid":
+    elif plant == "hybrid":
         throws = throw_hybrid(
             loaded, args.targets, args.throws, resolve(args.device), args.seed, args.calibrate
         )
     else:
         from visthrow.throws.reference_protocol import Throwing
 
-        with Throwing(loaded, args.targets, args.throws, args.plant, args.seed) as throwing:
+        with Throwing(loaded, args.targets, args.throws, plant, args.seed) as throwing:
             throws = throwing.results()
     entries = entries_of(loaded, unique_names(loaded), throws)
     if BASELINE in names:
@@ -119,8 +120,8 @@ def run(args: argparse.Namespace) -> int:
         " trained otherwise"
         for name, departed in departures.items()
     ]
-    comparison = on_plant(args.plant, args.seed, entries, "".join(notes))
-    figures = {"plant": args.plant, "seed": args.seed, "departures": departures}
+    comparison = on_plant(plant, args.seed, entries, "".join(notes))
+    figures = {"plant": plant, "seed": args.seed, "departures": departures}
     return _publish(args, comparison, figures)
 
 

@@ -12,18 +12,17 @@ add_arguments = declare(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of a kind, or one resolved config."""
-    if args.kind not in kinds.KINDS:
-        kinds.schema_of(args.kind)
+    kind = args.kind
+    if kind not in kinds.KINDS:
+        kinds.schema_of(kind)
     if args.name is None:
-        names = config.available(args.kind)
+        names = config.available(kind)
         if args.overrides:
-            raise ConfigError(
-                f"--set needs the NAME of a config; {args.kind} has: {', '.join(names)}"
-            )
+            raise ConfigError(f"--set needs the NAME of a config; {kind} has: {', '.join(names)}")
         print("\n".join(names))
         return 0
-    path = config.find(args.kind, args.name)
-    resolved = config.load(kinds.schema_of(args.kind, path.stem), path, args.overrides)
+    path = config.find(kind, args.name)
+    resolved = config.load(kinds.schema_of(kind, path.stem), path, args.overrides)
     print(config.dumps(resolved), end="")
     if args.json is not None:
         from visthrow.common.storage import write_json

@@ -23,6 +23,7 @@ add_arguments = declare(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
+    save = args.save
     find_policy(args.policy)  # printed before heavy imports
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy
@@ -35,9 +36,9 @@ def run(args: argparse.Namespace) -> int:
     writable(Path(args.out))
     if args.no_rope:
         return _fly_alone(args, loaded.experiment, goal)
-    if args.save:
-        check_place(args.save)
-        loaded.policy.save(args.save)
+    if save:
+        check_place(save)
+        loaded.policy.save(save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
     eyes = None if args.pixels is None else _make_rendered_eyes(loaded, args.pixels, args.seed)
@@ -53,8 +54,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{path}  the flight for other programs")
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
-    if args.save:
-        print(f"{args.save}  the policy for these conditions")
+    if save:
+        print(f"{save}  the policy for these conditions")
     if args.json:
         write_json(
             args.json,
@@ -147,13 +148,14 @@ def export(path: str, log, experiment) -> None:
 
 def summary_text(log) -> str:
     """Return a summary of the throw in a few lines."""
-    times = log.meta["times"]
-    result = log.meta["result"]
-    goal = log.meta["goal_w"]
+    meta = log.meta
+    times = meta["times"]
+    result = meta["result"]
+    goal = meta["goal_w"]
     start = times["policy_start"]
-    plant = f"{log.meta['plant_meaning']} (plant {log.meta['plant']}, seed {log.meta['seed']})"
+    plant = f"{meta['plant_meaning']} (plant {meta['plant']}, seed {meta['seed']})"
     lines = [
-        f"policy '{log.meta['policy']}' on {plant}",
+        f"policy '{meta['policy']}' on {plant}",
         f"hover   {start:.2f} s until the swing was quiet",
     ]
     if "separation" in times:

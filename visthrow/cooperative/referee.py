@@ -23,19 +23,20 @@ class MujocoTeam:
 
     def __init__(self, world: World, team: int):
         """Compile a model a world."""
+        count = world.count
         self.world = world
         self.team = team
-        self.worlds = world.count // team
+        self.worlds = count // team
         pairs, kinds = world.models()
-        members = [pairs[kinds[row]] for row in range(world.count)]
-        teams = [members[first : first + team] for first in range(0, world.count, team)]
+        members = [pairs[kinds[row]] for row in range(count)]
+        teams = [members[first : first + team] for first in range(0, count, team)]
         self._nominal = [_compile(members) for members in teams]
         self._data = [mujoco.MjData(model) for model in self._nominal]
         self._repeats = max(round(world.substep / STEP), 1)
         hinges = 2 * world.params.rope.segments
-        shapes = [(world.count, width) for width in (7, 6, hinges, hinges)]
+        shapes = [(count, width) for width in (7, 6, hinges, hinges)]
         self._arrays = [wp.zeros(shape, dtype=wp.float32) for shape in shapes]
-        self._rows = wp.array(np.arange(world.count), dtype=wp.int32)
+        self._rows = wp.array(np.arange(count), dtype=wp.int32)
         self._kernel = build_place(world, hinges=True)
         self.load_pos_w = wp.zeros(self.worlds, dtype=world.types.vec3)
         self.load_vel_w = wp.zeros_like(self.load_pos_w)
@@ -78,6 +79,7 @@ class MujocoTeam:
 
     def _show(self, world: int) -> None:
         """Copy a world's bodies into the arrays of the exchange."""
+        team = self.team
         model = self._nominal[world]
         data = self._data[world]
         bodies = self.world.bodies
@@ -86,16 +88,16 @@ class MujocoTeam:
         mujoco.mj_comVel(model, data)
         self.load_pos_w.numpy()[world] = data.qpos[:3]
         self.load_vel_w.numpy()[world] = data.qvel[:3]
-        places = data.qpos[3:].reshape(self.team, -1)
-        speeds = data.qvel[3:].reshape(self.team, -1)
-        rows = slice(world * self.team, (world + 1) * self.team)
+        places = data.qpos[3:].reshape(team, -1)
+        speeds = data.qvel[3:].reshape(team, -1)
+        rows = slice(world * team, (world + 1) * team)
         bodies.pos_w.numpy()[rows] = places[:, :3]
         bodies.quat_wb.numpy()[rows] = np.roll(places[:, 3:7], -1, axis=1)
         bodies.vel_w.numpy()[rows] = speeds[:, :3]
         bodies.rate_b.numpy()[rows] = speeds[:, 3:6]
         bodies.payload_pos_w.numpy()[rows] = data.qpos[:3]
         bodies.payload_vel_w.numpy()[rows] = data.qvel[:3]
-        for k in range(self.team):
+        for k in range(team):
             first = model.body(f"{k}_rod0").id
             rods = slice(first, first + self.world.params.rope.segments)
             directions = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]

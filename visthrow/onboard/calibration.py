@@ -321,15 +321,17 @@ class CalibrationProblem:
         """Return the steps j that sightings fall behind, and the share of the way to j + 1, each
         (N,).
         """
-        when = (self.time - self.age - latency).clamp(min=self.time[0], max=self.time[-1] - 1e-9)
-        j = (torch.searchsorted(self.time, when, right=True) - 1).clamp(0, len(self.time) - 2)
-        return j, (when - self.time[j]) / self.dt[j]
+        time = self.time
+        when = (time - self.age - latency).clamp(min=time[0], max=time[-1] - 1e-9)
+        j = (torch.searchsorted(time, when, right=True) - 1).clamp(0, len(time) - 2)
+        return j, (when - time[j]) / self.dt[j]
 
     def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
         """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5);
         zero where not seen. Arguments as of `steps`; j: steps that the sightings fall behind, shape
         (N,), held while differences are taken.
         """
+        camera = self.camera
         c = self.split(constants)
         s = self.spreads
         dt = self.dt[j][:, None]
@@ -345,16 +347,16 @@ class CalibrationProblem:
         length = self.length * (1.0 + c["length"][:, None])
         ball_w = body_w + _rotate(attitude, self.mount.expand_as(body_w)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
-        corners_w = goal_corners_w(goal_w, self.camera.square_w)
+        corners_w = goal_corners_w(goal_w, camera.square_w)
         corners_w = corners_w[:, None].expand(-1, body_w.shape[1], -1, -1)
         offsets = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
-        place = self.camera.position_b + c["lens"]
+        place = camera.position_b + c["lens"]
         in_body = torch.einsum("bnji,bnkj->bnki", attitude, offsets) - place[:, None, None]
-        rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
+        rot_bc = rotation_from_vector(c["camera"]) @ camera.rot_cb.T
         in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
         flat = in_camera.flatten(0, 1)
-        lens = self.camera.fisheye
-        rays = ball_extremes_c(lens, flat[:, 4], self.camera.params.payload_radius)
+        lens = camera.fisheye
+        rays = ball_extremes_c(lens, flat[:, 4], camera.params.payload_radius)
         points, _ = lens.project_normalized(torch.cat([flat[:, :4], rays], -2), clip=True)
         size = 1.0 + c["scale"][:, None]
         middle = points[:, :4].mean(1).unflatten(0, body_w.shape[:2])

@@ -329,26 +329,27 @@ _ABSENT = object()
 
 
 def _check_shapes(policy: Policy) -> None:
-    if not policy.weights or len(policy.weights) != len(policy.biases):
+    std = policy.std
+    weights = policy.weights
+    if not weights or len(weights) != len(policy.biases):
         raise PolicyError(
-            f"got {len(policy.weights)} weights and {len(policy.biases)} biases; expected a pair a"
-            " layer"
+            f"got {len(weights)} weights and {len(policy.biases)} biases; expected a pair a layer"
         )
-    width = policy.weights[0].shape[-1]
+    width = weights[0].shape[-1]
     if policy.estimator is not None and len(policy.estimator.output_bias) != width:
         raise PolicyError(
             f"the estimator gives {len(policy.estimator.output_bias)} numbers; the first layer"
             f" takes {width}"
         )
-    named = [("normalizer mean", policy.mean), ("normalizer std", policy.std)]
-    if (policy.mean is None) != (policy.std is None):
+    named = [("normalizer mean", policy.mean), ("normalizer std", std)]
+    if (policy.mean is None) != (std is None):
         raise PolicyError("a normaliser needs both mean and std; one is missing")
     for name, tensor in named:
         if tensor is not None and tensor.shape != (width,):
             raise PolicyError(
                 f"{name} has shape {tuple(tensor.shape)}; the first layer takes ({width},)"
             )
-    for i, (weight, bias) in enumerate(zip(policy.weights, policy.biases)):
+    for i, (weight, bias) in enumerate(zip(weights, policy.biases)):
         if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1]:
             received = f"weight {tuple(weight.shape)} and bias {tuple(bias.shape)}"
             raise PolicyError(f"layer {i} has {received}; expected (n, {width}) and (n,)")
@@ -357,10 +358,10 @@ def _check_shapes(policy: Policy) -> None:
     for name, tensor in named:
         if tensor is not None and not bool(torch.isfinite(tensor).all()):
             raise PolicyError(f"{name} holds numbers that are not finite")
-    if policy.std is not None and not bool((policy.std + policy.eps > 0.0).all()):
+    if std is not None and not bool((std + policy.eps > 0.0).all()):
         raise PolicyError(
             "normalizer std + eps must be above 0; the smallest is"
-            f" {float((policy.std + policy.eps).min())}"
+            f" {float((std + policy.eps).min())}"
         )
 
 

@@ -508,13 +508,14 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     from visthrow.onboard.observations import layout_of
     from visthrow.onboard.pilot import camera_conditions
 
-    layout = layout_of(experiment.task.observation)
+    task = experiment.task
+    layout = layout_of(task.observation)
     contract = {
         "observation": {
-            **config.to_dict(experiment.task.observation, defaults=whole),
+            **config.to_dict(task.observation, defaults=whole),
             "dimension": layout.dimension,
         },
-        "action": {**config.to_dict(experiment.task.action, defaults=whole), "dimension": 5},
+        "action": {**config.to_dict(task.action, defaults=whole), "dimension": 5},
         "control_period": experiment.sim.control_period,
         "release": {"lag": experiment.release.lag, "threshold": experiment.release.threshold},
         "vehicle": config.to_dict(experiment.vehicle, defaults=whole),
@@ -522,7 +523,7 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     }
     acting = config.to_dict(experiment, defaults=whole)
     contract |= {key: acting[key] for key in ("air", "laws") if key in acting}
-    if whole or experiment.task.observation.layout == "vision":
+    if whole or task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
     # for any vehicle: conditions of one are not the policy's
     if experiment.fleet is not None and not whole:
@@ -530,7 +531,7 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
             "rope_length": experiment.fleet.rope_length,
             "total_mass": experiment.fleet.total_mass,
         }
-        contract["action"] = {"max_rate": list(experiment.task.action.max_rate), "dimension": 5}
+        contract["action"] = {"max_rate": list(task.action.max_rate), "dimension": 5}
         contract = {
             key: value
             for key, value in contract.items()

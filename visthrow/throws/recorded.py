@@ -50,6 +50,7 @@ class ThrowRecorder(FlightObserver):
         self._sampled = -np.inf  # stamp of the last measured sample [s]
 
     def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
+        pilots = self.pilots
         state = flight.now
         self.add_truth(state)
         recorder = self.recorder
@@ -57,14 +58,12 @@ class ThrowRecorder(FlightObserver):
         throws = sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = state.time
-        sighted = (
-            self.pilots.eyes.last_keypoints if self.pilots.eyes is not None and throws else None
-        )
-        points, valid = sighted or self.pilots.pilots[0].see(
-            snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, self.pilots.goal_w
+        sighted = pilots.eyes.last_keypoints if pilots.eyes is not None and throws else None
+        points, valid = sighted or pilots.pilots[0].see(
+            snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, pilots.goal_w
         )
         keypoints = {"keypoints": points[0], "keypoints_valid": valid[0]}
-        recorder.add(state.time, goal_w=self.pilots.goal_w[0], mode=int(throws), **keypoints)
+        recorder.add(state.time, goal_w=pilots.goal_w[0], mode=int(throws), **keypoints)
         if sent.action is not None and sent.observation is not None:
             recorder.add(state.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)

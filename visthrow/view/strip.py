@@ -39,11 +39,12 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
 
     Raises LogError: the flight has no release or landing; StorageError: the place cannot be
     written."""
-    times = log.meta["times"]
+    meta = log.meta
+    times = meta["times"]
     if "separation" not in times or "landing" not in times:
         raise LogError(
             "the flight has no release and landing to draw:"
-            f" {log.meta['result'].get('failure') or 'it was cut short'}"
+            f" {meta['result'].get('failure') or 'it was cut short'}"
         )
     start = times["policy_start"]
     separation = times["separation"]
@@ -73,10 +74,10 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     texts = {"x": LEFT_MARGIN / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
-    if log.meta["plant"] == "poses":
-        where = f"Flown on {log.meta['plant_meaning']}"
+    if meta["plant"] == "poses":
+        where = f"Flown on {meta['plant_meaning']}"
     else:
-        where = f"Simulated on {log.meta['plant_meaning']}"
+        where = f"Simulated on {meta['plant_meaning']}"
     legend = (
         f"Faint: the vehicle every {GHOST_EVERY:g} s. Brown: the rope. Dashed: the ball in free"
         " flight."

@@ -54,31 +54,30 @@ class Renderer:
 
         from visthrow.detector_training.scenes.scene_kernel import SceneRow, ThingRow, render
 
+        device = self.device
         p = self.lens
-        image = torch.empty(
-            scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device
-        )
-        *tables, things = vars(scenes.to(self.device)).values()
+        image = torch.empty(scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=device)
+        *tables, things = vars(scenes.to(device)).values()
         table = torch.cat(tables, -1).float().contiguous()
         things = things.float().contiguous()
 
         def rows(tensor: torch.Tensor, struct: type) -> wp.array:
             """View of a tensor whose last axis holds the numbers of a struct."""
             shape = tensor.shape[:-1]
-            return wp.array(ptr=tensor.data_ptr(), dtype=struct, shape=shape, device=self.device)
+            return wp.array(ptr=tensor.data_ptr(), dtype=struct, shape=shape, device=device)
 
         def launch(part: slice) -> None:
             structs = (rows(table[part], SceneRow), rows(things[part], ThingRow))
             inputs = [seed, self.samples, *structs, self._pixels]
             outputs = [wp.from_torch(image[part])]
-            wp.launch(render, image[part].shape[:3], inputs, outputs, device=self.device)
+            wp.launch(render, image[part].shape[:3], inputs, outputs, device=device)
 
-        if self.device.startswith("cuda"):
-            torch.cuda.synchronize(self.device)  # Warp's stream is not torch's
+        if device.startswith("cuda"):
+            torch.cuda.synchronize(device)  # Warp's stream is not torch's
             launch(slice(0, scenes.count))
-            wp.synchronize_device(self.device)
+            wp.synchronize_device(device)
             return image
-        wp.load_module(device=self.device, module="visthrow.detector_training.scenes.scene_kernel")
+        wp.load_module(device=device, module="visthrow.detector_training.scenes.scene_kernel")
         # Warp runs a launch on the CPU in the thread that asks for it
         share = -(-scenes.count // torch.get_num_threads())
         parts = (slice(first, first + share) for first in range(0, scenes.count, share))

@@ -109,11 +109,12 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
 
     A throw fails when the controller's programme is not solved, the cable slackens or the payload
     falls short. The release comes at the plan's time, within a control period if need be."""
+    carry = plan.path.duration
     params = MPCParams()
     controller = MPC(plan.model, params)
-    steps = math.ceil(plan.path.duration / params.period - 1e-6)
+    steps = math.ceil(carry / params.period - 1e-6)
     horizon = params.stages
-    last = plan.path.duration - (steps - 1) * params.period
+    last = carry - (steps - 1) * params.period
     reference = plan.reference(0.0, params.period, steps + horizon)
     state = random_starts(plan, count, seed)
     good = np.ones(count, bool)
@@ -148,7 +149,7 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
         times,
         landing_w=point,
         error=np.linalg.norm(point - [plan.target, 0.0], axis=1),
-        duration=plan.path.duration + fall,
+        duration=carry + fall,
         clearance=np.full(count, np.nan),
         smoothness=smoothness,
         tracking=np.sqrt(tracking / steps),

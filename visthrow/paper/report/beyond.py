@@ -135,20 +135,21 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
 
 def training_section(thrown: ResultSet) -> Section:
     """Every training run with its time."""
-    if not thrown.runs:
+    runs = thrown.runs
+    if not runs:
         none = Text(
             "No training is recorded: `visthrow sweep run paper`, then `visthrow sweep collect"
             " paper`.",
             "missing",
         )
         return parts.section("training", "Training runs", none)
-    total = sum(_seconds(run) or 0.0 for run in thrown.runs)
+    total = sum(_seconds(run) or 0.0 for run in runs)
     lead = Text(
-        f"{len(thrown.runs)} trainings, {total / 60:.0f} minutes in all, each on the device that"
+        f"{len(runs)} trainings, {total / 60:.0f} minutes in all, each on the device that"
         " its row names."
     )
     groups: dict[str, list[ndarray]] = defaultdict(list)
-    for run in thrown.runs:
+    for run in runs:
         points = [point for point in run.get("curve", []) if None not in point]
         if len(points) > 1:
             curve = np.array(points, dtype=float)
@@ -168,7 +169,7 @@ def training_section(thrown: ResultSet) -> Section:
         "Time: all pieces of the run. Final: throws from hover at 2.0 m in its own simulator, at"
         " the end of the training."
     )
-    table = Grid.from_rows("Training runs", header, map(_run_row, thrown.runs), note)
+    table = Grid.from_rows("Training runs", header, map(_run_row, runs), note)
     return parts.section("training", "Training runs", lead, picture, table)
 
 

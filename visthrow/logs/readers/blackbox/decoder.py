@@ -138,17 +138,19 @@ class _Decoder:
         return pos
 
     def _prepare(self) -> None:
-        if "I" not in self.fields or "P" not in self.fields:
+        header = self.header
+        fields = self.fields
+        if "I" not in fields or "P" not in fields:
             raise LogError("its header does not define I and P frames")
-        names = self.fields["I"].names
+        names = fields["I"].names
         missing = {"time", "loopIteration"}.difference(names)
         if missing:
             raise LogError(f"its I frames have no field {' or '.join(sorted(missing))}")
-        self.fields["P"].names = names
-        self.fields["P"].signed = self.fields["I"].signed
-        if self.header.get("Data version", "2") != "2":
-            raise LogError(f"data version {self.header['Data version']}; expected version 2")
-        for kind, definition in self.fields.items():
+        fields["P"].names = names
+        fields["P"].signed = fields["I"].signed
+        if header.get("Data version", "2") != "2":
+            raise LogError(f"data version {header['Data version']}; expected version 2")
+        for kind, definition in fields.items():
             sizes = {len(definition.names), len(definition.predictor), len(definition.encoding)}
             if len(sizes) > 1:
                 raise LogError(
@@ -162,20 +164,20 @@ class _Decoder:
                 )
         self.plans = {
             kind: plan(definition.encoding, [p == INC for p in definition.predictor])
-            for kind, definition in self.fields.items()
+            for kind, definition in fields.items()
         }
         self.at_time = names.index("time")
         self.at_iteration = names.index("loopIteration")
         self.at_motor0 = names.index("motor[0]") if "motor[0]" in names else None
-        output = _numbers(self.header.get("motorOutput", "0"), "motorOutput")
+        output = _numbers(header.get("motorOutput", "0"), "motorOutput")
         self.constant = {
-            MINTHROTTLE: _int(self.header, "minthrottle"),
+            MINTHROTTLE: _int(header, "minthrottle"),
             P1500: 1500,
-            VBATREF: _int(self.header, "vbatref"),
+            VBATREF: _int(header, "vbatref"),
             MINMOTOR: output[0],
         }
-        self.interval = max(1, _int(self.header, "I interval", 32))
-        num, _, denom = self.header.get("P interval", "1/1").partition("/")
+        self.interval = max(1, _int(header, "I interval", 32))
+        num, _, denom = header.get("P interval", "1/1").partition("/")
         self.p_num, self.p_denom = (int(num), int(denom)) if denom else (1, max(1, int(num)))
 
     def decode(self) -> BlackboxLog:
