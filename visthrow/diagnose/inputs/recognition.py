@@ -79,7 +79,7 @@ class Recognition:
         why: Reasons, by channel.
     """
 
-    def __init__(self, time: ndarray, groups: list[Group], settings: dict[str, str]) -> None:
+    def __init__(self, time: ndarray, groups: list[Group], settings: dict[str, str]):
         """Take the groups that move, at stamps [s]; ``settings`` stand above a table's numbers."""
         self.time = time
         self.settings = settings

@@ -23,7 +23,7 @@ class DrivenModel(NumericModel):
     latent_step = 1e-2
     knot_count = 8
 
-    def __init__(self, logs: Sequence[FlightLog], params: QuadrotorParams) -> None:
+    def __init__(self, logs: Sequence[FlightLog], params: QuadrotorParams):
         """Cut the flights into windows; the channels that are looked at, that drive the model, and
         that it needs are known.
 

@@ -50,7 +50,7 @@ class ImuModel(DrivenModel):
     channels = CHANNELS
     lawless = "nothing tells the attitude and the velocity that a law is made of"
 
-    def __init__(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
+    def __init__(self, logs: Sequence[FlightLog], params: ImuParams):
         """See the base class; the gyro is left out where the setup states no torques, or where the
         motors do not tell what turns the vehicle.
         """
