@@ -142,7 +142,7 @@ def write_run_folder(
 def check_free(folder: str | Path) -> None:
     """Refuse a folder that holds a run with a StorageError."""
     if (Path(folder) / "config.toml").exists():
-        raise StorageError(f"{folder} holds a run already; name another folder, or resume it")
+        raise StorageError(f"{folder} holds a run already; name another with --out, or resume it")
 
 
 def _git(root: Path, *arguments: str) -> str:

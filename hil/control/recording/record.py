@@ -25,7 +25,7 @@ from hil.params import HilParams
 from hil.poses.pose import Pose
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.errors import ConfigError, StorageError
+from visthrow.common.errors import ConfigError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -41,12 +41,6 @@ PROVENANCE = "provenance.json"
 EXPECTED = f"expected {CONFIG}, {POLICY} and {TICKS} in it"
 
 
-def check_free(folder: Path) -> None:
-    """Raise `StorageError` for a folder that holds a run already."""
-    if (folder / CONFIG).exists():
-        raise StorageError(f"{folder} holds a run already; name another folder with --out")
-
-
 @contextmanager
 def begun(folder: Path) -> Iterator[None]:
     """Keep a new folder only where the run that is to write it begins; raises `StorageError` for
@@ -54,7 +48,7 @@ def begun(folder: Path) -> Iterator[None]:
 
     The links write theirs before there is a recorder.
     """
-    check_free(folder)
+    provenance.check_free(folder)
     new = not folder.exists()
     try:
         yield
@@ -72,7 +66,6 @@ class RunRecorder:
         a run already, or cannot be written.
         """
         self.folder = Path(folder)
-        check_free(self.folder)
         source = find_policy(params.policy)
         data = source.read_bytes()
         provenance.write_run_folder(
