@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 
@@ -95,7 +96,7 @@ def _radtan(values: Values, plane: Array) -> Array:
 
 def _fov(values: Values, plane: Array) -> Array:
     """Devernay and Faugeras, "Straight lines have to be straight", MVA 13, 2001, eq. 13."""
-    radius = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
+    radius = np.maximum(norm(plane, axis=1), 1e-12)
     bent = np.arctan(2.0 * radius * math.tan(values["w"] / 2.0)) / values["w"]
     return plane * (bent / radius)[:, None]
 
@@ -185,7 +186,7 @@ def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
     axial = np.broadcast_to(np.cos(theta)[:, None, None], (ANGLES, TURNS, 1))
     rays = np.concatenate([lateral, axial], axis=2)
     pixels = project(model, values, rays.reshape(-1, 3)).reshape(ANGLES, TURNS, 2)
-    radius = np.linalg.norm(pixels - pixels[:1], axis=2)
+    radius = norm(pixels - pixels[:1], axis=2)
     with np.errstate(invalid="ignore"):
         grows = np.vstack([np.isfinite(radius[:1]), np.diff(radius, axis=0) > 0.0])
         on_image = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=2)
@@ -233,7 +234,7 @@ def fit_fisheye(
     parameters = _fit_radial(
         theta, direction, pixels, np.array([values["cx"], values["cy"]]), values
     )
-    error = np.linalg.norm(_project_ours(parameters, theta, direction) - pixels, axis=1)
+    error = norm(_project_ours(parameters, theta, direction) - pixels, axis=1)
     coefficients = tuple(float(k) for k in parameters[4:])
     folds = min(limit, monotonic_limit(coefficients) * (1.0 - 1e-9))
     lens = dict(zip(("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), map(float, parameters)))
@@ -267,7 +268,7 @@ def _fit_radial(
     from scipy.optimize import least_squares
 
     crooked = any(values.get(name, 0.0) for name in ("p1", "p2", "skew", "shear"))
-    slope = np.linalg.norm(pixels - centre, axis=1)[theta > 0.0] / theta[theta > 0.0]
+    slope = norm(pixels - centre, axis=1)[theta > 0.0] / theta[theta > 0.0]
     focal = float(np.median(slope[theta[theta > 0.0] < 0.3 * theta.max()]))
     free = np.array([True, True, crooked, crooked, True, True, True, True])
     start = np.array([focal, focal, *centre, 0.0, 0.0, 0.0, 0.0])
@@ -294,7 +295,7 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
     off = corners - [fisheye.cx, fisheye.cy]
     plane = off / [fisheye.fx, fisheye.fy]
-    radius = np.linalg.norm(plane, axis=1).max()
+    radius = norm(plane, axis=1).max()
     values = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
     low_angle = 0.0
     high_angle = limit

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy import ndarray
+from numpy.linalg import norm
 
 from camera.fisheye import Fisheye
 
@@ -114,7 +115,7 @@ def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
     for i, j in combinations(range(min(len(single), MOST_PAIRED)), 2):
         first, one = single[i]
         second, two = single[j]
-        if np.linalg.norm(first - second) < one + two:
+        if norm(first - second) < one + two:
             joined = np.concatenate([outlines[i], outlines[j]]).astype(np.float32)
             centre, radius = cv2.minEnclosingCircle(joined)
             pairs.append((np.array(centre), float(radius)))
@@ -159,17 +160,17 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         # About the mean ray the plane is nearly across; in its basis the least squares are well
         # conditioned.
         mean = rays[good].mean(axis=0)
-        frame = _basis(mean / np.linalg.norm(mean))
+        frame = _basis(mean / norm(mean))
         local = rays[good] @ frame
         plane = local[:, :2] / local[:, 2:]
         columns = np.column_stack([plane, np.ones(len(plane))])
         normal = frame @ np.linalg.lstsq(columns, 1.0 / local[:, 2], rcond=None)[0]
-        size = float(np.linalg.norm(normal))
+        size = float(norm(normal))
         if not size > 1.0:
-            return axis / np.linalg.norm(axis), 0.0, math.inf, 0.0
+            return axis / norm(axis), 0.0, math.inf, 0.0
         axis = normal / size
         half_angle = math.acos(1.0 / size)
-        sine = np.linalg.norm(np.cross(rays, axis), axis=1)
+        sine = norm(np.cross(rays, axis), axis=1)
         off = np.arctan2(sine, rays @ axis) / half_angle - 1.0
         # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
         # points count.
@@ -200,7 +201,7 @@ def fit_goal(
     """
     rays = rays_of(lens, outline)
     centre = rays.mean(axis=0)
-    frame = _basis(centre / np.linalg.norm(centre))
+    frame = _basis(centre / norm(centre))
     local = rays @ frame
     if local[:, 2].min() < 0.3:
         return None  # as wide as the whole view
@@ -215,7 +216,7 @@ def fit_goal(
     if misfit > MOST_BENT or share < 0.5 or rim < LEAST_RIM:
         return None
     rays_c = np.column_stack([outer, np.ones(4)]) @ frame.T
-    rays_c = rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True)
+    rays_c = rays_c / norm(rays_c, axis=1, keepdims=True)
     return rays_c, (share - misfit + min(rim, 0.5)) / 1.5
 
 
@@ -260,10 +261,10 @@ def _refine_corners(
         if start is None or end is None:
             return None
         way = end - start
-        length = np.linalg.norm(way, axis=1)
+        length = norm(way, axis=1)
         lacking = SEARCH_MARGIN / np.maximum(length, 1e-9) - 0.35 / 0.75
         way *= 1.0 + np.maximum(0.0, lacking)[:, None]
-        length = np.linalg.norm(way, axis=1)
+        length = norm(way, axis=1)
         steps = math.ceil(float(length.max()) / STEP)
         reach = np.linspace(0.0, 1.0, max(8, steps))
         u, v = (start[:, i, None] + way[:, i, None] * reach for i in range(2))
@@ -274,7 +275,7 @@ def _refine_corners(
         edge = rays_of(lens, start[hit] + way[hit] * distance[hit, None]) @ frame
         line, off = _line(edge[:, :2] / edge[:, 2:])
         lines.append(line)
-        misfit.append(off / np.linalg.norm(side))
+        misfit.append(off / norm(side))
         share.append(hit.mean())
     met = np.array([_meet(lines[i - 1], lines[i]) for i in range(4)])
     reach = 0.6 * np.abs(corners - middle).max()
@@ -367,7 +368,7 @@ def _basis(ray: ndarray) -> ndarray:
     """
     helper = np.array([1.0, 0.0, 0.0]) if abs(ray[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     x = helper - ray * (helper @ ray)
-    x /= np.linalg.norm(x)
+    x /= norm(x)
     return np.column_stack([x, np.cross(ray, x), ray])
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
 
@@ -135,7 +136,7 @@ class BallGoalTracker:
             stamp: of the frame [s].
         """
         if self._begin is not None:
-            length = float(np.linalg.norm(self._begin))
+            length = float(norm(self._begin))
             self._ball = BallTrack(self._begin / length, stamp, *INITIAL_SPREADS)
             self._half_angle = math.asin(self._radius / length)
             self._begin = None
@@ -157,7 +158,7 @@ class BallGoalTracker:
         if self._squares:
             offset = np.append(self._likeliest().place_w, 0.0) - eye_w
             where["goal_ray_c"] = rot_wc.T @ _unit(offset)
-            where["goal_within"] = self._side / float(np.linalg.norm(offset))
+            where["goal_within"] = self._side / float(norm(offset))
         return Prior(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(
@@ -197,7 +198,7 @@ class BallGoalTracker:
             distance = self._eye_w[2] / -ray_w[2]
             place_w = self._eye_w[:2] + ray_w[:2] * distance
             offsets = [square.place_w - place_w for square in self._squares]
-            distances = [float(np.linalg.norm(offset)) for offset in offsets]
+            distances = [float(norm(offset)) for offset in offsets]
             i = int(np.argmin([*distances, self._side]))  # the last: a new one
             if i in squares:
                 continue
@@ -218,7 +219,7 @@ class BallGoalTracker:
 
 
 def _unit(vector: ndarray) -> ndarray:
-    return vector / np.linalg.norm(vector)
+    return vector / norm(vector)
 
 
 def _perpendicular(vector: ndarray, ray: ndarray) -> ndarray:

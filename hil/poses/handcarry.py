@@ -12,6 +12,7 @@ from itertools import pairwise, product
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from hil.errors import RunError
 from hil.links.clock import Clock
@@ -116,7 +117,7 @@ def find_steps(poses: Sequence[Pose]) -> list[MeasuredMove]:
         MeasuredMove(_mean(good[a.stop - 1 :: -1], a), _mean(good[b.start :], b))
         for a, b in pairwise(rests)
     ]
-    return [s for s in steps if np.linalg.norm(s.way) > LEAST_WAY or s.turn > LEAST_TURN]
+    return [s for s in steps if norm(s.way) > LEAST_WAY or s.turn > LEAST_TURN]
 
 
 def _rests(poses: Sequence[Pose]) -> list[slice]:
@@ -129,8 +130,8 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     early = np.maximum(np.searchsorted(times, times - SPAN, side="right") - 1, 0)
     span = np.maximum(times[late] - times[early], 1e-9)
     # the angle of a turn is the same whatever the order of the quaternions
-    rate = np.linalg.norm(vectors_between(quat[early], quat[late]), axis=1) / span
-    resting = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
+    rate = norm(vectors_between(quat[early], quat[late]), axis=1) / span
+    resting = (norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
     turns = np.diff(resting, prepend=False, append=False)
     edges = np.flatnonzero(turns).reshape(-1, 2)  # of each rest: its first pose, and one past it
     return [
@@ -145,7 +146,7 @@ def _mean(poses: Sequence[Pose], span: slice) -> Pose:
     ]
     quat = continuous(np.array([p.quat for p in close])).mean(axis=0)
     place = tuple(np.mean([p.pos for p in close], axis=0).tolist())
-    return replace(close[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
+    return replace(close[0], pos=place, quat=tuple((quat / norm(quat)).tolist()))
 
 
 def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
@@ -174,15 +175,13 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
 
     fitting = replace(max(cases, key=fit), yaw_offset_deg=_yaw(ways, turn_of(world)))
     lines = [*(_line(move, step, frames) for move, step in pairs), _start(steps[0].before, frames)]
-    mirrored = bool(
-        np.linalg.det(np.column_stack([way / np.linalg.norm(way) for _, way in ways])) < -0.5
-    )
+    mirrored = bool(np.linalg.det(np.column_stack([way / norm(way) for _, way in ways])) < -0.5)
     return CarryResult(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
 def _agreement(turn: ndarray, vectors: list[tuple[int, ndarray]]) -> float:
     """Return the sum of the cosines between turned vectors and the axes that they belong to."""
-    return sum(float((turn @ v)[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
+    return sum(float((turn @ v)[axis] / max(norm(v), 1e-12)) for axis, v in vectors)
 
 
 def _yaw(ways: list[tuple[int, ndarray]], world: ndarray) -> float:
@@ -198,7 +197,7 @@ def _line(move: CarryMove, step: MeasuredMove, frames: FrameParams) -> Line:
     ours = Frames(frames)
     motion = step.turns(ours)[1] if move.turn else np.array(ours.world_from_source(tuple(step.way)))
     size = "rad about" if move.turn else "m along"
-    length = float(np.linalg.norm(motion))
+    length = float(norm(motion))
     angle = math.acos(max(-1.0, min(1.0, motion[move.axis] / max(length, 1e-12))))
     passed = angle <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     numbers = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", motion))

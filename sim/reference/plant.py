@@ -9,6 +9,7 @@ from dataclasses import MISSING, fields, replace
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from sim.params import GRAVITY, PlantParams
 from sim.reference import vehicle_blocks
@@ -158,7 +159,7 @@ class ReferencePlant:
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"]
-        n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+        n = n / norm(n, axis=-1, keepdims=True)
         n_dot = values["cable_vel_w"]
         n_dot = n_dot - np.sum(n_dot * n, -1, keepdims=True) * n
         body = pos, values["quat_wb"], vel, values["rate_b"], block, np.zeros((count, 6))
@@ -455,9 +456,9 @@ class ReferencePlant:
             self._attached = self._attached & ~due
 
     def _normalise(self) -> None:
-        self._state[:, QUAT] /= np.linalg.norm(self._state[:, QUAT], axis=1, keepdims=True)
+        self._state[:, QUAT] /= norm(self._state[:, QUAT], axis=1, keepdims=True)
         n, n_dot, _, _ = self._rope_of(self._state)
-        n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        n /= norm(n, axis=-1, keepdims=True)
         n_dot -= np.sum(n * n_dot, -1, keepdims=True) * n
 
     def _land(self, before: ndarray, clock: ndarray, step: ndarray) -> None:
@@ -540,7 +541,7 @@ class ReferencePlant:
             name: getattr(sample, name) + sigma * rng.standard_normal((self.count, 3))
             for name, sigma in sigmas.items()
         }
-        noisy["quat_wb"] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+        noisy["quat_wb"] = quat / norm(quat, axis=1, keepdims=True)
         return replace(
             sample,
             time=max(time, 0.0),

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from camera.field_bounds import Bound, BoundedFields, NotNegative, Spread
 from visthrow.common.free_fall import GRAVITY
@@ -110,11 +111,11 @@ class HoverController:
         params = self.params
         error_w = np.asarray(goal_w, dtype=float) - pos_w
         asked_w = params.position_gain * error_w
-        speed = np.linalg.norm(asked_w, axis=1, keepdims=True)
+        speed = norm(asked_w, axis=1, keepdims=True)
         fast = speed > params.max_speed
         asked_w *= np.where(fast, params.max_speed / np.maximum(speed, 1e-9), 1.0)
         # On the way there from far off an integral would only wind up, and overshoot on arrival.
-        close = np.linalg.norm(error_w, axis=1, keepdims=True) < params.integral_radius
+        close = norm(error_w, axis=1, keepdims=True) < params.integral_radius
         growth_w = np.where(close, params.integral_gain * self.period * error_w, 0.0)
         self._integral_w = np.clip(
             self._integral_w + growth_w, -params.integral_limit, params.integral_limit
@@ -131,7 +132,7 @@ def _limit_tilt(thrust_w: ndarray, max_tilt: float) -> ndarray:
     from the vertical.
     """
     up = np.maximum(thrust_w[:, 2], 0.1 * GRAVITY)  # falling is no reason to turn over
-    flat = np.linalg.norm(thrust_w[:, :2], axis=1)
+    flat = norm(thrust_w[:, :2], axis=1)
     scale = np.minimum(1.0, np.tan(max_tilt) * up / np.maximum(flat, 1e-9))
     return np.column_stack((thrust_w[:, :2] * scale[:, None], up))
 
@@ -140,10 +141,8 @@ def _rates(rot_wb: ndarray, thrust_w: ndarray, yaw: ndarray, params: HoverParams
     """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and
     the heading to yaw.
     """
-    aim_b = np.einsum(
-        "eji,ej->ei", rot_wb, thrust_w / np.linalg.norm(thrust_w, axis=1, keepdims=True)
-    )
-    sine = np.linalg.norm(aim_b[:, :2], axis=1)
+    aim_b = np.einsum("eji,ej->ei", rot_wb, thrust_w / norm(thrust_w, axis=1, keepdims=True))
+    sine = norm(aim_b[:, :2], axis=1)
     angle = np.arctan2(sine, aim_b[:, 2])
     # e_z x aim = (-aim_y, aim_x, 0); upside down exactly, any axis will do.
     axis = np.where(sine[:, None] > 1e-9, np.column_stack((-aim_b[:, 1], aim_b[:, 0])), (1.0, 0.0))

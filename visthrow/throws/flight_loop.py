@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.onboard.pilot import Pilot
@@ -336,7 +337,7 @@ class Flight:
         return {
             "the simulation failed": ~(np.isfinite(pos_w) & np.isfinite(payload_w)).all(1),
             **terminations.out_of_bounds(bounds, pos_w),
-            "the payload hit the vehicle": np.linalg.norm(payload_w - pos_w, axis=1) < touching,
+            "the payload hit the vehicle": norm(payload_w - pos_w, axis=1) < touching,
             **{cause: mask & ~snapshot.latched for cause, mask in carrying.items()},
         }
 
@@ -381,7 +382,7 @@ class Scores(FlightObserver):
             return
         state = flight.now
         self.smoothness.add(sent.action, flight.flown)
-        distance = np.linalg.norm(state.payload_pos_w - state.pos_w, axis=1)
+        distance = norm(state.payload_pos_w - state.pos_w, axis=1)
         flying = ~state.attached & ~flight.plant.landing.landed
         self.clearance = np.where(flying, np.minimum(self.clearance, distance), self.clearance)
 
@@ -393,7 +394,7 @@ class Scores(FlightObserver):
         goal = flight.goal_at(landing.time)[:, :2]
         columns = {
             "landing_w": point,
-            "error": np.linalg.norm(point - goal, axis=1),
+            "error": norm(point - goal, axis=1),
             "duration": landing.time - flight.begin,
             "clearance": self.clearance,
             "smoothness": self.smoothness.value,

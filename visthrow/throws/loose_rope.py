@@ -11,6 +11,7 @@ Comput. Phys. 23, 1977)."""
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from sim.params import GRAVITY
 
@@ -44,8 +45,8 @@ class LooseRope:
         self.offset_w = np.array(points_w[:-1], dtype=float) - ball_w
         self.velocity_w = np.array(velocity_w[:-1], dtype=float) - ball_vel_w
         ends = np.vstack((self.offset_w, np.zeros(3)))
-        self._lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
-        last = np.linalg.norm(np.asarray(points_w[-1]) - points_w[-2])
+        self._lengths = norm(np.diff(ends, axis=0), axis=1)
+        last = norm(np.asarray(points_w[-1]) - points_w[-2])
         # where the rope ends on the last link, from the ball
         self._knot = 1.0 - last / self._lengths[-1]
 
@@ -104,7 +105,7 @@ def _place_on_link(joint: ndarray, end: ndarray, length: float, ground: float) -
     centre [m].
     """
     offset = joint - end
-    offset *= length / max(float(np.linalg.norm(offset)), 1e-9)
+    offset *= length / max(float(norm(offset)), 1e-9)
     lowest = max(ground - end[2], -length)
     if offset[2] >= lowest:
         return end + offset

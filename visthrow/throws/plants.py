@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from sim.params import AirParams, RandomizationParams, RopeParams
 from sim.reference.snapshot import PayloadLandings as PayloadLandings
@@ -379,9 +380,9 @@ def flown(
     def acceleration(v: ndarray) -> ndarray:
         airspeed = v - wind
         sideways = np.cross([0.0, 0.0, 1.0], airspeed)
-        size = np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-12)
+        size = np.maximum(norm(sideways, axis=1, keepdims=True), 1e-12)
         turned = side * sideways + lift * np.cross(airspeed, sideways / size)
-        speed = np.linalg.norm(airspeed, axis=1, keepdims=True)
+        speed = norm(airspeed, axis=1, keepdims=True)
         return speed * (turned - share * airspeed) - [0.0, 0.0, GRAVITY]
 
     count = max(int(np.ceil(np.max(time, initial=0.0) / FALL_STEP)), 1)
@@ -426,7 +427,7 @@ def _late(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
         newer = values[row, rows]
         older = values[row + 1, rows]
         late[name] = newer + share * (older - newer)
-    late["quat_wb"] /= np.linalg.norm(late["quat_wb"], axis=1, keepdims=True)
+    late["quat_wb"] /= norm(late["quat_wb"], axis=1, keepdims=True)
     return replace(newest, **late)
 
 
@@ -436,5 +437,5 @@ def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: flo
     """
     tilt = angle * rng.standard_normal((count, 2))
     down = np.column_stack((tilt, -np.ones(count)))
-    down /= np.linalg.norm(down, axis=1, keepdims=True)
+    down /= norm(down, axis=1, keepdims=True)
     return np.repeat(down[:, None], segments, axis=1)

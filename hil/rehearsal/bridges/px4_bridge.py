@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.facts import values
@@ -79,7 +80,7 @@ def between(before: Motion, after: Motion, time: float) -> Motion:
     vel, rate = (
         (1.0 - s) * a + s * b for a, b in ((before.vel, after.vel), (before.rate, after.rate))
     )
-    return Motion(time, pos, vel, quat / np.linalg.norm(quat), rate)
+    return Motion(time, pos, vel, quat / norm(quat), rate)
 
 
 @dataclass
@@ -166,7 +167,7 @@ class HangingBall:
         self._ball = before + STEP * self._vel
         if self.attached:
             off = self._ball - mount
-            reach = float(np.linalg.norm(off))
+            reach = float(norm(off))
             if reach > self.length:
                 self._ball = mount + off * (self.length / reach)
             self._ball[2] = max(self._ball[2], self.ground)
@@ -181,7 +182,7 @@ class HangingBall:
 
     def _damp(self, vel: ndarray) -> ndarray:
         """Return a velocity relative to the vehicle after a step of damping."""
-        speed = float(np.linalg.norm(vel))
+        speed = float(norm(vel))
         loss = min(2.0 * math.log(2.0) / HALVING * speed, MOST_DAMPING)
         return vel * (1.0 - STEP * loss / max(speed, 1e-9))
 
@@ -297,7 +298,7 @@ class Px4Sih(Bridge):
         quat = np.array([x, -y, -z, w], dtype=float)
         rate = FLIP * (message.rollspeed, message.pitchspeed, message.yawspeed)
         place = self._place.update(time, message)
-        self.plant.follow(Motion(time, *place, quat / np.linalg.norm(quat), rate))
+        self.plant.follow(Motion(time, *place, quat / norm(quat), rate))
 
     def fly(self) -> None:
         """Fly a period once PX4 has flown it; without PX4, a period as it was."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from sim.params import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
@@ -69,8 +70,8 @@ def _results_of(
     separation.
     """
     pos_w, vel_w = separated
-    columns["position_error"] = np.linalg.norm(pos_w - plan.release.pos_w, axis=1)
-    columns["velocity_error"] = np.linalg.norm(vel_w - plan.release.vel_w, axis=1)
+    columns["position_error"] = norm(pos_w - plan.release.pos_w, axis=1)
+    columns["velocity_error"] = norm(vel_w - plan.release.vel_w, axis=1)
     columns = blank_failed(success, columns)
     return Flown(plan.target, success, **columns, step_times=np.array(step_times))
 
@@ -148,7 +149,7 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
         (state[:, pm.POS], state[:, pm.VEL]),
         times,
         landing_w=point,
-        error=np.linalg.norm(point - [plan.target, 0.0], axis=1),
+        error=norm(point - [plan.target, 0.0], axis=1),
         duration=carry + fall,
         clearance=np.full(count, np.nan),
         smoothness=smoothness,
@@ -163,7 +164,7 @@ def pendulum_state(snapshot: Snapshot, mount_b: ndarray) -> ndarray:
     rot = matrix_of_quat(snapshot.quat_wb)
     arm = rot @ mount_b
     cable = snapshot.payload_pos_w - snapshot.pos_w - arm
-    length = np.linalg.norm(cable, axis=1, keepdims=True)
+    length = norm(cable, axis=1, keepdims=True)
     moving = (
         snapshot.payload_vel_w
         - snapshot.vel_w
