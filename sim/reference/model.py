@@ -80,8 +80,8 @@ def add_pushes(spec: "mujoco.MjSpec", site: str, names: tuple[str, ...]) -> None
 def build_attached(
     body: BodyParams,
     rope: RopeParams,
-    joints: Literal["universal", "ball"],
-    stretch: tuple[float, float] | None,
+    joints: Literal["universal", "ball"] = "universal",
+    stretch: tuple[float, float] | None = None,
 ) -> "mujoco.MjModel":
     """Build the quadrotor with its rope.
 
@@ -100,7 +100,7 @@ def build_attached(
     return spec.compile()
 
 
-def build_free(rope: RopeParams, stretch: tuple[float, float] | None) -> "mujoco.MjModel":
+def build_free(rope: RopeParams, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
     """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
     spec = new_spec()
     add_chain(rope, spec.worldbody, "ball", stretch=stretch, free_root=True)

@@ -39,11 +39,14 @@ def checked_number(
     return parse
 
 
+ABOVE_ZERO = checked_number(float, lambda x: 0.0 < x < math.inf, "a number above 0")
+WHOLE = checked_number(int, lambda x: x >= 0, "a whole number of 0 or more")
+
 TYPES: Mapping[str, Callable[[str], Any]] = {
     "number": checked_number(float, math.isfinite, "a finite number"),
-    "above zero": checked_number(float, lambda x: 0.0 < x < math.inf, "a number above 0"),
+    "above zero": ABOVE_ZERO,
     "distance": checked_number(float, lambda x: 0.0 <= x <= 3.0, "a distance from 0 to 3 m"),
-    "whole": checked_number(int, lambda x: x >= 0, "a whole number of 0 or more"),
+    "whole": WHOLE,
     "count": checked_number(int, lambda x: x > 0, "a whole number of 1 or more"),
     "port": checked_number(int, lambda x: 0 < x < 65536, "a port, 1 to 65535"),
     "int": int,

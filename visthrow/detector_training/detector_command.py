@@ -44,7 +44,7 @@ def throw(args: argparse.Namespace) -> int:
     check_plant(args.plant)
     loaded = load_policy(args.policy, None, args.overrides)
     if loaded.policy.contract["observation"]["layout"] != "vision":
-        raise VisthrowError(f"policy '{loaded.name}'; expected one of the layout vision")
+        raise VisthrowError(f"policy '{loaded.name}' sees states; expected a vision policy")
     looks = {
         "device": resolve(args.device),
         "method": args.by,
