@@ -77,7 +77,7 @@ def _on_reference(
 
 def run(args: argparse.Namespace) -> int:
     """Fly and write."""
-    importlib.import_module("piqp")  # printed once, not by every worker
+    importlib.import_module("piqp")  # a missing package is reported once, not by every worker
     path = Path(args.records) / "throws" / "baseline.json"
     known = results.load_all([path])
     units = results.work(

@@ -44,7 +44,7 @@ class Bound:
 Positive = Annotated[float, Bound(0.0, ends="(]")]
 NotNegative = Annotated[float, Bound(0.0)]
 Vector = tuple[float, float, float]  # of numbers along three axes
-Spread = tuple[NotNegative, NotNegative, NotNegative]
+NotNegativeVector = tuple[NotNegative, NotNegative, NotNegative]
 Share = Annotated[float, Bound(0.0, 1.0)]
 # Of anything that flies in a hall: what lies beyond is a wrong unit.
 Mass = Annotated[float, Bound(0.0, 1e5, "(]")]  # [kg]

@@ -22,9 +22,9 @@ from camera.field_bounds import (
     Length,
     Mass,
     NotNegative,
+    NotNegativeVector,
     Positive,
     Share,
-    Spread,
     Vector,
 )
 from sim.law_factors import LAW_FACTORS
@@ -135,11 +135,11 @@ class ControllerParams(BoundedFields):
     k_f)``."""
 
     kind: Literal["betaflight", "motor_mixing", "geometric"]
-    p_gain: Spread  # [N m s/rad]
-    i_gain: Spread  # [N m/rad]
-    d_gain: Spread  # [N m s^2/rad]
-    feedforward_gain: Spread  # [N m s^2/rad]
-    integral_limit: Spread  # [N m]
+    p_gain: NotNegativeVector  # [N m s/rad]
+    i_gain: NotNegativeVector  # [N m/rad]
+    d_gain: NotNegativeVector  # [N m s^2/rad]
+    feedforward_gain: NotNegativeVector  # [N m s^2/rad]
+    integral_limit: NotNegativeVector  # [N m]
     setpoint_time_constant: Duration  # [s]
     gyro_time_constant: Duration  # [s]
     min_thrust: NotNegative  # f_min a motor, idle [N]
@@ -153,7 +153,7 @@ class ControllerParams(BoundedFields):
     # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
     relax_threshold: Positive = 0.698
     # of the lag of g that P and I of ``motor_mixing`` see [-]
-    gyro_share: Spread = (1.0, 1.0, 1.0)
+    gyro_share: NotNegativeVector = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ class RopeParams(BoundedFields):
     payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
     compliance: NotNegative = 0.0  # lengthening for every newton of pull [m/N]
     # of a box that swings about its upper face, homogeneous [m]; 0: a ball, rigid on the rope
-    payload_sides: Spread = (0.0, 0.0, 0.0)
+    payload_sides: NotNegativeVector = (0.0, 0.0, 0.0)
     # of two cables without mass, along body x, that hold the box in the rope's place [m]; 0: a rope
     cables_apart: NotNegative = 0.0
     gripper_mass: NotNegative = 0.0  # at the rope's lower end, which holds the payload [kg]
@@ -568,10 +568,10 @@ class RandomizationParams(BoundedFields):
     on top of the body's."""
 
     spawn_height: float  # of the vehicle's centre of mass [m]
-    position: Spread  # +- [m]
-    velocity: Spread  # +- [m/s]
-    attitude_deg: Spread  # +- roll, pitch, yaw [deg]
-    rate_deg: Spread  # +- body rates [deg/s]
+    position: NotNegativeVector  # +- [m]
+    velocity: NotNegativeVector  # +- [m/s]
+    attitude_deg: NotNegativeVector  # +- roll, pitch, yaw [deg]
+    rate_deg: NotNegativeVector  # +- body rates [deg/s]
     mass: NotNegative  # +- fraction of the vehicle's mass
     cable_angle_deg: NotNegative  # +- roll of the cable [deg]
     cable_rate_deg: NotNegative  # +- rates of its roll and yaw [deg/s]

@@ -4,7 +4,7 @@ default.
 
 from dataclasses import dataclass
 
-from camera.field_bounds import BoundedFields, NotNegative, Positive, Spread, Vector
+from camera.field_bounds import BoundedFields, NotNegative, NotNegativeVector, Positive, Vector
 
 
 @dataclass(frozen=True)
@@ -19,14 +19,14 @@ class ReferenceExtras(BoundedFields):
     payload_drag: NotNegative = 0.0
     wind_mean_w: Vector = (0.0, 0.0, 0.0)  # world frame [m/s]
     # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
-    wind_sigma_w: Spread = (0.0, 0.0, 0.0)
+    wind_sigma_w: NotNegativeVector = (0.0, 0.0, 0.0)
     wind_time_constant: Positive = 1.0  # of that process [s]
     # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
     stretch_stiffness: NotNegative = 0.0
     stretch_damping: NotNegative = 0.0  # [N s/m]
     extra_joint_damping: NotNegative = 0.0  # added to RopeParams.joint_damping [N m s]
     com_offset: Vector = (0.0, 0.0, 0.0)  # centre of mass from the frame's origin, body frame [m]
-    com_offset_sigma: Spread = (0.0, 0.0, 0.0)  # [m]
+    com_offset_sigma: NotNegativeVector = (0.0, 0.0, 0.0)  # [m]
     thrust_gain_error: float = 0.0  # relative, all motors alike [-]
     thrust_gain_sigma: NotNegative = 0.0  # relative, all motors alike [-]
     motor_gain_sigma: NotNegative = 0.0  # relative, each motor for itself [-]

@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     check(args.targets)
     for name in args.policies or ():
         if name != BASELINE:
-            find_policy(name)  # printed before heavy imports
+            find_policy(name)  # reports an unknown name before heavy imports
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import check_plant

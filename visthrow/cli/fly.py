@@ -24,7 +24,7 @@ add_arguments = declare(__file__)
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     save = args.save
-    find_policy(args.policy)  # printed before heavy imports
+    find_policy(args.policy)  # reports an unknown name before heavy imports
     from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy
     from visthrow.throws.recorded import check_goal, fly

@@ -4,14 +4,14 @@ from camera.field_bounds import (
     Bound,
     BoundedFields,
     NotNegative,
+    NotNegativeVector,
     Positive,
     Share,
-    Spread,
     Vector,
 )
 from visthrow.common.errors import ConfigError
 
-__all__ = ["Bound", "Bounded", "NotNegative", "Positive", "Share", "Spread", "Vector"]
+__all__ = ["Bound", "Bounded", "NotNegative", "NotNegativeVector", "Positive", "Share", "Vector"]
 
 
 class Bounded(BoundedFields):

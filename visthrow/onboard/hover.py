@@ -11,7 +11,7 @@ import numpy as np
 from numpy import ndarray
 from numpy.linalg import norm
 
-from camera.field_bounds import Bound, BoundedFields, NotNegative, Spread
+from camera.field_bounds import Bound, BoundedFields, NotNegative, NotNegativeVector
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
 
@@ -39,7 +39,7 @@ class HoverParams(BoundedFields):
     max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the commanded thrust [rad]
     attitude_gain: NotNegative = 9.0  # [1/s]
     yaw_gain: NotNegative = 2.0  # [1/s]
-    max_rate: Spread = (8.0, 8.0, 2.0)  # [rad/s]
+    max_rate: NotNegativeVector = (8.0, 8.0, 2.0)  # [rad/s]
     min_thrust: NotNegative = 0.2  # [N]
     max_thrust: NotNegative = 14.0  # [N]
 

@@ -28,7 +28,7 @@ from sim.params import (
 from sim.scaling.vehicle_class import FleetParams
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive, Spread, Vector
+from visthrow.config.bounds import Bound, Bounded, NotNegative, NotNegativeVector, Positive, Vector
 
 Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
@@ -46,7 +46,7 @@ class ActionParams(Bounded):
 
     # body rates at +-1 [rad/s] and collective thrust at +1 [N]; an experiment replaces 0 by its
     # vehicle's
-    max_rate: Spread = (0.0, 0.0, 0.0)
+    max_rate: NotNegativeVector = (0.0, 0.0, 0.0)
     max_thrust: NotNegative = 0.0
 
 

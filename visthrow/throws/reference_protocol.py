@@ -161,7 +161,7 @@ class Throwing(Workers):
             size: throws of a policy in a batch; fewer are sooner done where there are more cores.
                 Other sizes, other draws.
         """
-        importlib.import_module("mujoco")  # printed once, not by every worker
+        importlib.import_module("mujoco")  # a missing package is reported once, not by every worker
         plant = plant_of(loaded[0].experiment)
         if together and any(plant_of(item.experiment) != plant for item in loaded):
             raise ConfigError("policies of different plants cannot fly in one batch")

@@ -1,10 +1,12 @@
 """Progress of a training run: printed lines, and a CSV row an iteration."""
 
 import csv
+import io
 import math
 import time
 from datetime import timedelta
 from pathlib import Path
+from types import TracebackType
 
 from visthrow.common.storage import atomic_write
 from visthrow.task.measurement import Throws
@@ -51,9 +53,12 @@ class TrainLog:
         self.done = done
         self.minutes = minutes
         rows = _rows(path, done) if done and path.exists() else []
-        atomic_write(path, "".join([",".join(COLUMNS) + "\n", *rows]))
-        wall = COLUMNS.index("wall_s")
-        self._before = float(rows[-1].split(",")[wall]) if rows else 0.0
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        atomic_write(path, text.getvalue())
+        self._before = float(rows[-1]["wall_s"]) if rows else 0.0
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(
@@ -63,8 +68,14 @@ class TrainLog:
     def __enter__(self) -> "TrainLog":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
+    def __exit__(
+        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._file.close()
+        except OSError:
+            if error is None:
+                raise
 
     def row(self, figures: dict, throws: Throws | None = None) -> None:
         """Write one iteration's figures and, where it ended in throws, what came of them; OSError
@@ -104,8 +115,13 @@ class TrainLog:
         return max(min(remaining, 60.0 * self.minutes - elapsed), 0.0)
 
 
-def _rows(path: Path, done: int) -> list[str]:
+def _rows(path: Path, done: int) -> list[dict]:
     """Return the whole rows of a log up to an iteration."""
-    rows = path.read_text(encoding="utf-8").splitlines(keepends=True)[1:]
-    whole = [row for row in rows if row.endswith("\n")]
-    return [row for row in whole if int(row.partition(",")[0]) <= done]
+    rows = []
+    with path.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            iteration = row.get("iteration") or ""
+            whole = iteration.isdigit() and row.get(COLUMNS[-1]) is not None
+            if whole and int(iteration) <= done:
+                rows.append(row)
+    return rows

@@ -59,7 +59,9 @@ class Options:
 
 
 def run(args: Any) -> int:
-    """Train by :class:`Options`, or as many attributes; returns the exit status of the command."""
+    """Train; returns the exit status of the command.
+
+    ``args``: has the fields of :class:`Options`."""
     _check(args)
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")

@@ -203,7 +203,7 @@ class Recognition:
                 continue
             nose_up = columns != entry.columns
             unusual = (order != entry.order) + (bool(axes) != motive)
-            doubt = _UNUSUAL * (unusual + 2.0 * (nose_up != named_nose_up))
+            doubt = _UNUSUAL * (unusual + (nose_up != named_nose_up))
             doubt += _TILTED * (physics.median_tilt(channel.samples().values) > physics.STEEPEST)
             doubt += _TILTED * self._leans_by_accelerometers(channel, axes)
             words = [unit] * open_unit + [f"order {order}"] * open_order

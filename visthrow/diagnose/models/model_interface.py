@@ -21,7 +21,7 @@ from sim.effects.effect import Effect
 from sim.params import LawParams
 
 
-def _none() -> ndarray:
+def _no_indices() -> ndarray:
     return np.zeros(0, dtype=int)
 
 
@@ -43,10 +43,11 @@ class Window:
     nuisance: ndarray  # X, shape (N, D)
     nuisance_sd: ndarray  # vague prior of b, about 0, shape (D,)
     latent: ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
-    latent_block: ndarray = field(default_factory=_none)  # index into LATENT_BLOCKS, shape (G,)
-    latent_axis: ndarray = field(default_factory=_none)  # 0, 1, 2 for x, y, z, shape (G,)
+    # index into LATENT_BLOCKS, shape (G,)
+    latent_block: ndarray = field(default_factory=_no_indices)
+    latent_axis: ndarray = field(default_factory=_no_indices)  # 0, 1, 2 for x, y, z, shape (G,)
     # of the knot [s], shape (G,): each block and axis has the same ones, in order
-    latent_time: ndarray = field(default_factory=_none)
+    latent_time: ndarray = field(default_factory=lambda: np.zeros(0))
     knots: Mapping[str, ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
     the catalogue: ``time``, ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N],

@@ -94,7 +94,7 @@ def landing_gain(
     """Measure the change of predicted landings by the named causes.
 
     ``trained``: flight -> their sizes by the other flights; empty where none were held out.
-    None where the model has no throws whose landing was seen.
+    None where no landing was measured.
     """
     model = work.problem.model
     flown = sorted({w.flight for w in work.after.windows})
@@ -104,9 +104,7 @@ def landing_gain(
     named = model.landings(theta, flown) if theta else plain
     held_landings = named
     if trained:
-        parts = [model.landings(trained[f], [f]) for f in plain.flights]
-        columns = zip(*(vars(part).values() for part in parts))
-        held_landings = type(plain)(*map(np.concatenate, columns))
+        held_landings = plain.join(model.landings(trained[f], [f]) for f in plain.flights)
     good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)
     if not good.any():
         return None

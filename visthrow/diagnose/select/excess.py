@@ -102,8 +102,8 @@ def _likelihood(point: Point, key: tuple[int, str], level: float) -> float:
     """Return the log likelihood of a phase's residuals under a level of a block and phase."""
     windows = [w for w, gram in enumerate(point.grams) if gram.phase == key[1]]
     noise = point.noise
-    levels_of = {**noise.latent_sd, key: level}
-    tried = replace(noise, latent_sd=levels_of, share=noise.share[windows])
+    latent_sd = {**noise.latent_sd, key: level}
+    tried = replace(noise, latent_sd=latent_sd, share=noise.share[windows])
     return fitted([point.grams[w] for w in windows], tried)[1].sum()
 
 
@@ -168,5 +168,5 @@ def too_strong(point: Point, share: float) -> tuple[str, ...]:
     medians = [np.median(of_phase) for of_phase in thrusts.values()]
     weight = max(medians, default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")
-    levels_of = point.noise.latent_sd.items()
-    return tuple(phase for (b, phase), level in levels_of if b == block and level > share * weight)
+    levels = point.noise.latent_sd.items()
+    return tuple(phase for (b, phase), level in levels if b == block and level > share * weight)

@@ -44,7 +44,7 @@ From half of it as a deviation 0 and 1 are told apart: half way is two from both
 """
 
 
-def _without(statistics: Statistics, effects: int, lost: ndarray) -> Statistics:
+def _assume_lost(statistics: Statistics, effects: int, lost: ndarray) -> Statistics:
     """Return what windows say of the effects if so much of each command did not come, shape
     (W, T).
     """
@@ -59,7 +59,7 @@ def divergence(lost: ndarray, share: float) -> float:
     return -float((entr(lost) + entr(1.0 - lost) + odds).sum())
 
 
-def _likelier(score: ndarray, information: ndarray, share: float, lost: ndarray) -> ndarray:
+def _improve(score: ndarray, information: ndarray, share: float, lost: ndarray) -> ndarray:
     """Return the probabilities that commands did not come, from a guess on, by what each window
     gains most from until all that is left is worth little.
 
@@ -87,7 +87,7 @@ def _likelier(score: ndarray, information: ndarray, share: float, lost: ndarray)
     return lost
 
 
-def _bound(
+def _bound_evidence(
     statistics: Statistics, priors: Priors, named: Sequence[int], share: float, lost: ndarray
 ) -> tuple[float, ndarray]:
     """Return log Z of a set of effects where that share of the commands did not come, as a bound
@@ -99,10 +99,10 @@ def _bound(
     theta = statistics.theta[:effects]
     for _ in range(ROUNDS):
         change = theta - statistics.theta[:effects]
-        lost = _likelier(
+        lost = _improve(
             statistics.score[:, effects:] - on_effects @ change, information, share, lost
         )
-        came = _without(statistics, effects, lost)
+        came = _assume_lost(statistics, effects, lost)
         theta = Posterior.of(came, priors).mean(named)
     unsure = lost * (1.0 - lost)
     spread = 0.5 * float((information.diagonal(axis1=1, axis2=2) * unsure).sum())
@@ -117,7 +117,7 @@ def _profile(
     """
     effects = len(priors.floor)
     none = np.zeros_like(statistics.score[:, effects:])
-    plain = evidence_of(_without(statistics, effects, none), priors, named)
+    plain = evidence_of(_assume_lost(statistics, effects, none), priors, named)
     nats = []
     probabilities = []
     guess = np.full_like(none, shares[0])
@@ -125,13 +125,13 @@ def _profile(
     for i, share in enumerate(shares.tolist()):
         if i:  # as if each command were alone
             guess = expit(logit(guess) + odds[i] - odds[i - 1])
-        value, guess = _bound(statistics, priors, named, share, guess)
+        value, guess = _bound_evidence(statistics, priors, named, share, guess)
         nats.append(value - plain)
         probabilities.append(guess)
     return np.array(nats), probabilities
 
 
-def _sized(scatter: Scatter, information: ndarray, lost: ndarray) -> Scatter:
+def _with_size(scatter: Scatter, information: ndarray, lost: ndarray) -> Scatter:
     """Return the verdict with the share of those commands of which a window tells by itself whether
     they came, with Jeffreys' interval; ``information``: on all commands, shape (W, T, T).
     """
@@ -187,5 +187,5 @@ def verdict(
     scatter = judged(v, reach, least, threshold, sum(counts), COMMAND)
     lost = probabilities[1][int(np.argmax(least))]
     count = len(priors.floor)
-    scatter = _sized(scatter, statistics.information[:, count:, count:], lost)
+    scatter = _with_size(scatter, statistics.information[:, count:, count:], lost)
     return scatter, tuple(row[:length] for row, length in zip(lost, counts))

@@ -57,6 +57,12 @@ class PredictedLandings:
         """Return the errors of the prediction from the separation [m], shape (F,)."""
         return self._distance(self.released)
 
+    @classmethod
+    def join(cls, parts: Iterable["PredictedLandings"]) -> "PredictedLandings":
+        """Join the landings of several predictions."""
+        columns = zip(*(vars(part).values() for part in parts))
+        return cls(*map(np.concatenate, columns))
+
     def _distance(self, points: ndarray) -> ndarray:
         return np.linalg.norm((points - self.measured)[:, :2], axis=1)
 

@@ -359,6 +359,14 @@ class ThrowEnv(ThrowEpisodes):
         return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
-        """Take up a state of :meth:`state_dict`, of an environment of this experiment and size."""
+        """Take up a state of :meth:`state_dict`.
+
+        Raises ValueError: the state is of an environment of another experiment or size.
+        """
         for name, target in self._tensors().items():
+            if name not in saved or saved[name].shape != target.shape:
+                have = tuple(saved[name].shape) if name in saved else "nothing"
+                raise ValueError(
+                    f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}"
+                )
             target.copy_(saved[name])
