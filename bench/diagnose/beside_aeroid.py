@@ -6,7 +6,7 @@ the diagnosis runs, without the names. Worlds come from scipy's integrator; nois
 correlated over 30 ms as a tracker's filter leaves it.
 
     pip install -c constraints.txt "visthrow[beside]"
-    python -m bench.diagnose.beside_aeroid 10 --out bench/diagnose/beside-aeroid.json
+    python -m bench.diagnose.beside_aeroid 10 --out bench/diagnose/ledgers/beside-aeroid.json
 """
 
 import argparse

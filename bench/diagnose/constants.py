@@ -4,7 +4,7 @@
     python -m bench.diagnose.constants compare fix.jsonl
 
 An answer that depends on a constant differs between the two values on either side of it. The other
-half, ``bank-confirm.txt``, tests the chosen values.
+half, ``banks/confirm.txt``, tests the chosen values.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from pathlib import Path
 from bench.diagnose import two_checkouts
 
 ROOT = Path(__file__).parents[2]
-BANK = ROOT / "bench/diagnose/bank-fix.txt"
+BANK = ROOT / "bench/diagnose/banks/fix.txt"
 EVIDENCE = Path("visthrow/diagnose/likelihood/evidence.py")
 BASE = "as it is"
 VALUES = {

@@ -1,7 +1,7 @@
 """Worlds of another author's generator: a quadrotor with a ball on a cable, flown by another
 controller, for named vehicles.
 
-    python -m bench.diagnose.foreign --seeds bench/diagnose/bank-foreign.txt --jobs 6 --ledger
+    python -m bench.diagnose.foreign --seeds bench/diagnose/banks/foreign.txt --jobs 6 --ledger
     foreign.jsonl
 
 Written from the equations alone: bodies in maximal coordinates with the cable as a constraint
@@ -10,7 +10,7 @@ Runge-Kutta steps. Noise, sampling and names are its own. A world hides one effe
 outside the catalogue; the tool gets the vehicle's numbers as its owner would know them.
 
 Each line of the seed list is a seed; vehicle, kind and size follow from it. A list is used once:
-faults that it shows are mended on other seeds. The worlds of ``bank-foreign.txt`` were flown
+faults that it shows are mended on other seeds. The worlds of ``banks/foreign.txt`` were flown
 without drag, so that no wind could show, and knew one foreign force."""
 
 import argparse

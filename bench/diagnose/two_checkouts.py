@@ -1,8 +1,8 @@
 """Answer the worlds of banks with two checkouts of the project, and compare the answers.
 
     python -m bench.diagnose.two_checkouts answer --trees OLD NEW --jobs 40 --ledger two.jsonl \\
-        --banks bench/diagnose/bank-confirm.txt \\
-        --foreign bench/diagnose/bank-foreign-confirm.txt
+        --banks bench/diagnose/banks/confirm.txt \\
+        --foreign bench/diagnose/banks/foreign-confirm.txt
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
 With one tree only that one answers, as the new one. Each world is flown once, by this checkout, and
