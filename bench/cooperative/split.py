@@ -57,7 +57,7 @@ def halves(args: argparse.Namespace, rope: Any) -> dict[str, Any]:
     single = load_policy(args.policy, overrides=changes)
     count = 2 * args.throws
     actor = single.policy.actor(count)
-    throws = throw(single.experiment, actor, args.target, count, seed=args.seed)
+    throws = throw(single.experiment, actor, args.target, count, "cpu", args.seed)
     error = throws.error[throws.success]
     return {
         "way": f"in halves, one after the other: {single.name}",

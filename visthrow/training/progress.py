@@ -7,6 +7,7 @@ import time
 from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
+from typing import TextIO
 
 from visthrow.common.storage import atomic_write
 from visthrow.task.measurement import Throws
@@ -54,16 +55,14 @@ class TrainLog:
         self.minutes = minutes
         rows = _rows(path, done) if done and path.exists() else []
         text = io.StringIO()
-        writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer = _writer(text)
         writer.writeheader()
         writer.writerows(rows)
         atomic_write(path, text.getvalue())
         self._before = float(rows[-1]["wall_s"]) if rows else 0.0
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
-        self._writer = csv.DictWriter(
-            self._file, COLUMNS, extrasaction="ignore", lineterminator="\n"
-        )
+        self._writer = _writer(self._file)
 
     def __enter__(self) -> "TrainLog":
         return self
@@ -113,6 +112,11 @@ class TrainLog:
         if self.minutes is None:
             return remaining
         return max(min(remaining, 60.0 * self.minutes - elapsed), 0.0)
+
+
+def _writer(file: TextIO) -> csv.DictWriter:
+    """Return a writer of the log's columns."""
+    return csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
 
 
 def _rows(path: Path, done: int) -> list[dict]:

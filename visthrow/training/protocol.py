@@ -18,8 +18,8 @@ def throw(
     policy,
     target: float,
     count: int,
-    device: str = "cpu",
-    seed: int = 0,
+    device: str,
+    seed: int,
     build: Callable[..., ThrowEnv] = ThrowEnv,
     begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
 ) -> Throws:

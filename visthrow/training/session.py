@@ -11,8 +11,8 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,29 +39,8 @@ CHECKPOINT_SHARE = 0.01
 FIRST = 20.0  # time after which the first of them comes then: what it costs is not known before [s]
 
 
-@dataclass(frozen=True)
-class Options:
-    """The options of ``visthrow train``; its help describes each."""
-
-    config: str | None = None
-    seed: int | None = None
-    out: str | None = None
-    start: str | None = None  # policy to start from
-    iterations: int | None = None
-    minutes: float | None = None
-    until: float | None = None  # [m]
-    evaluate_every: int | None = None
-    checkpoint_every: int | None = None
-    resume: bool = False
-    device: str = "auto"
-    overrides: Sequence[str] = ()
-    json: str | None = None
-
-
-def run(args: Any) -> int:
-    """Train; returns the exit status of the command.
-
-    ``args``: has the fields of :class:`Options`."""
+def run(args: Namespace) -> int:
+    """Train with the arguments of ``visthrow train``; returns the exit status of the command."""
     _check(args)
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
@@ -105,7 +84,7 @@ def run(args: Any) -> int:
     return 0 if why == OUT_OF_TIME else EXIT_INTERRUPTED
 
 
-def _check(args: Options) -> None:
+def _check(args: Namespace) -> None:
     """Refuse words that contradict each other, with a TrainError."""
     if args.until is not None and args.until >= EVALUATION_TARGET:
         raise TrainError(
@@ -120,7 +99,7 @@ def _check(args: Options) -> None:
         raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
 
 
-def _begin(args: Options, path: Path, folder: Path) -> tuple:
+def _begin(args: Namespace, path: Path, folder: Path) -> tuple:
     """Experiment, policy to start from or None, and seed of a new run; StorageError where the
     folder holds one already.
     """
@@ -133,7 +112,7 @@ def _begin(args: Options, path: Path, folder: Path) -> tuple:
     return fitted(experiment, policy), policy, seed
 
 
-def _resume(args: Options, path: Path | None, folder: Path) -> tuple:
+def _resume(args: Namespace, path: Path | None, folder: Path) -> tuple:
     """Experiment, None and seed of the run in the folder; CheckpointError where there is none, or
     what is named contradicts it.
     """
@@ -198,7 +177,7 @@ class Regularly:
         self._next = end + (end - begin) / self._share
 
 
-def _loop(args: Options, trainer, folder: Path, last: int) -> str:
+def _loop(args: Namespace, trainer, folder: Path, last: int) -> str:
     """Train with log, evaluation and checkpoints, the last one at the end; return why it ended.
 
     TrainError where a file cannot be written; what the last checkpoint holds is not lost.
@@ -274,7 +253,7 @@ def _compare(name: str | None, rows: list[dict]) -> None:
     )
 
 
-def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
+def _report(args: Namespace, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
     throws = trainer.final_throws()
     rows = [one.summary() for one in throws["flown"]]

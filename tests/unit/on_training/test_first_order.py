@@ -229,7 +229,7 @@ def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
     assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
     actor = Policy.load(find_policy("state")).actor(200)
-    fine, coarser = (protocol.throw(e, actor, 2.0, 200, seed=3) for e in (experiment, coarse))
+    fine, coarser = (protocol.throw(e, actor, 2.0, 200, "cpu", 3) for e in (experiment, coarse))
     assert fine.success.all()
     assert coarser.success.all()
     assert abs(fine.landing_w.mean(0) - coarser.landing_w.mean(0)).max() < ALIKE

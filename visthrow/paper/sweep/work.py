@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from visthrow.cli import api
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
@@ -104,28 +105,26 @@ def train(
     """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow
     train``.
     """
-    from visthrow.training import session
     from visthrow.training.trainer import CHECKPOINT
 
     folder = source.folder(out)
     resume = (folder / CHECKPOINT).is_file()
     if folder.exists() and not resume:  # killed before its first checkpoint
         shutil.rmtree(folder)
-    options = session.Options(
-        source.config,
-        source.seed,
-        str(folder),
-        minutes=minutes,
-        checkpoint_every=checkpoint_every,
-        resume=resume,
-        device=device,
-        overrides=source.changes,
-    )
+    options = {
+        "seed": source.seed,
+        "out": folder,
+        "minutes": minutes,
+        "checkpoint_every": checkpoint_every or None,
+        "resume": resume,
+        "device": device,
+        "set": source.changes,
+    }
     start = time.perf_counter()
     began = datetime.now(UTC).isoformat(timespec="seconds")
     status = 1
     try:
-        status = session.run(options)
+        status = api.run("train", [source.config], options)
         status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
     finally:
         piece = {

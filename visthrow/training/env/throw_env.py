@@ -116,8 +116,7 @@ class ThrowEnv(ThrowEpisodes):
         """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control
         period.
         """
-        pose = self.delay.exact(age)
-        return self._state_frame(pose, self.views.goal_w)
+        return self._state_frame(self.delay.exact(age), self.views.goal_w)
 
     def begin_throws(self, correction: tuple[Tensor, Tensor]) -> TensorDict:
         """Begin throws where the vehicles are, with the ``correction`` that a calibration in hover

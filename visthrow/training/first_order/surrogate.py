@@ -92,7 +92,7 @@ class FlightBatch:
         self.failed = torch.zeros(times, E, dtype=torch.bool, **make)
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
         self._mask = wp.from_torch(self.flying)
-        (vehicle, rope) = env.sim.plants()
+        vehicle, rope = env.sim.plants()
         above = rope["total_mass"] - rope["payload_mass"]
         parts = (
             vehicle["body"]["mass"],

@@ -45,7 +45,6 @@ def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
         "entropy_coef": p.entropy,
         "value_loss_coef": p.value_coefficient,
         "max_grad_norm": p.max_grad_norm,
-        "use_clipped_value_loss": True,
         "muon": p.muon,
     }
     return {
