@@ -40,6 +40,7 @@ CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
+LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
 _RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
 DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
@@ -54,6 +55,7 @@ _COMPARED = 4000  # samples of an accelerometer that are compared at each delay
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
+_FORCES = (0.5, 2.0)  # ratios of two measurements of one force
 _TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
 _HEAVIEST = 0.9  # share of the mass that a payload may have
 _UP = np.array([0.0, 0.0, GRAVITY])  # what an accelerometer at rest measures [m/s^2]
@@ -360,8 +362,26 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
         wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is not None:
         yield wrong
+    else:
+        yield from _list_unchecked(acc)
     if wrong is None or wrong.verdict == "warn":
         yield from _check_push(relation, acc, pushed, channels, sensed)
+
+
+def _list_unchecked(acc: np.ndarray) -> Iterator[Row]:
+    """Name the axes along which a path hardly accelerates, shape (N, 3): its mirror image fits as
+    well.
+    """
+    power = np.var(acc, axis=0)
+    share = power / np.sum(power)
+    needed = 0.5 * CLEARLY  # what a mirror image turns counts twice in a correlation
+    for axis, part in zip("xy", share.tolist()):
+        if part < needed:
+            text = (
+                f"cannot be answered: {100 * part:.2g} % of the acceleration is along {axis},"
+                f" {100 * needed:g} % is needed"
+            )
+            yield Row("answers", f"mirrored {axis}", "warn", text, {"share": part})
 
 
 def _turned_path(turn: headings.Turn, channels: str) -> Row | None:
@@ -436,6 +456,7 @@ class _LevelForces:
     plain: float  # largest correlation as they are, at any delay
     turned: complex  # size: correlation where they are turned; angle: by which
     mirrored: float  # correlation with their mirror image
+    size: float  # of those by the accelerometer, in that of those by the path
     relation: relations.Relation | None  # between both
 
     @property
@@ -460,6 +481,7 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
     level = np.array([1.0, 1.0, 0.0])
     plain = 0.0
     mirrored = 0.0
+    size = 0.0
     turned = 0.0j
     best: tuple[Samples, Samples] | None = None
     for late in np.arange(-reach, reach + 0.5 * _DELAY_WARN, _DELAY_WARN):
@@ -470,10 +492,11 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
         if max(abs(kept), abs(flipped)) > max(abs(turned), mirrored):
             turned = kept
             mirrored = abs(flipped)
+            size = _spread(measured) / _spread(expected)
             best = Samples(grid, expected), Samples(grid, measured)
     if best is None:
         return None
-    return _LevelForces(plain, turned, mirrored, relations.relate(*best, reach=_DELAY_BAD))
+    return _LevelForces(plain, turned, mirrored, size, relations.relate(*best, reach=_DELAY_BAD))
 
 
 def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
@@ -490,7 +513,8 @@ def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: st
     nats = 0.5 * samples * np.log((1.0 - plain**2) / (1.0 - correlation**2))
     nats -= np.log(len(EXCHANGES))  # an angle is a choice like that among exchanges
     surely = nats > _NATS and correlation > max(_CORRELATED, plain + CLEARLY)
-    if not surely:
+    keeps_size = _FORCES[0] < forces.size < _FORCES[1]  # as any mount does
+    if not (surely and keeps_size):
         return None
     angle = np.degrees(np.angle(forces.turned))
     off_quarter = abs(angle - 90.0 * round(angle / 90.0))
@@ -549,7 +573,7 @@ def _check_push(
             )
             yield Row("frames", channels, "bad" if strong else "warn", text, figures)
         return
-    yield from _together_rows(relation, channels, figures, (0.5, 2.0))
+    yield from _together_rows(relation, channels, figures, _FORCES)
     if sensed:
         yield _late(relation, channels, figures, False)
         if np.linalg.norm(off) > _OFFSET:
@@ -661,18 +685,21 @@ def _check_following(
     if _turned(relation):
         return _report_other_axes(relation, channels, "the rates follow the commands")
     is_measured = relation.delay_sd < _UNTOLD
-    late = is_measured and relation.delay < -0.005
+    early = is_measured and relation.delay < -0.005
+    slow = is_measured and relation.delay - 2.0 * relation.delay_sd > LATEST
     hint = relations.unit_hint(relation.scale)
     hint = hint if "degrees" in hint else ""  # a gain may be any other number
     weak = relation.correlation < FIRMLY
-    verdict = "bad" if hint else "warn" if late or weak else "ok"
+    verdict = "bad" if hint else "warn" if early or slow or weak else "ok"
     when = f"{1e3 * relation.delay:.1f} ms later" if is_measured else "at an unknown delay"
     text = (
         f"the rates follow {when}, correlation {relation.correlation:.2f}, gain"
         f" {relation.scale:.2f}"
     )
-    if late:
+    if early:
         text += ": before they were commanded"
+    elif slow:
+        text += f", more than {1e3 * LATEST:.0f} ms: is the commands' clock early?"
     elif hint:
         text += f": {hint}"
     elif weak:

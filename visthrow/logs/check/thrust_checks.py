@@ -13,6 +13,7 @@ from visthrow.logs.check.physics import (
     CLEARLY,
     FIRMLY,
     GRAVITY,
+    LATEST,
     MOVES,
     accelerations,
     hangs,
@@ -51,8 +52,7 @@ _FOLLOWS = 0.4
 # flight's
 _AGAINST = 8.0
 _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
-_LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
-_OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < _LATEST)  # delays that motors have
+_OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < LATEST)  # delays that motors have
 _MOTORS = 0.07  # what they usually take [s]
 MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
 MASS_BAD = 1.0  # likewise: another unit or map
