@@ -23,7 +23,7 @@ def train(config: str | Path, *, out: str | Path, **options: Any) -> "Policy":
     """Train a policy and return it; ``out`` is the folder of the run."""
     from visthrow.onboard.policy import Policy
 
-    run("train", [config], {"out": out, **options})
+    _run("train", [config], {"out": out, **options})
     return Policy.load(Path(out) / "policy.npz")
 
 
@@ -33,7 +33,7 @@ def fly(
     """Fly one throw and return its log; ``out`` is the folder of the files."""
     from visthrow.logs.flightlog import FlightLog
 
-    run("fly", [], {"policy": policy, "out": out, **options})
+    _run("fly", [], {"policy": policy, "out": out, **options})
     return FlightLog.load(Path(out) / "flight.npz")
 
 
@@ -51,12 +51,12 @@ def _run_json(command: str, words: list[Any], options: Mapping[str, Any]) -> dic
     """Run a command and return its figures."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "figures.json"
-        run(command, words, {**options, "json": path})
+        _run(command, words, {**options, "json": path})
         figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     return figures
 
 
-def run(command: str, words: list[Any], options: Mapping[str, Any]) -> int:
+def _run(command: str, words: list[Any], options: Mapping[str, Any]) -> int:
     """Run a command of the command line and return its status.
 
     Raises VisthrowError for a mistake that the command names, for an unknown option too."""

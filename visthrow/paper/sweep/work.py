@@ -10,6 +10,7 @@ import platform
 import shutil
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -18,7 +19,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from visthrow.cli import api
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
@@ -105,26 +105,33 @@ def train(
     """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow
     train``.
     """
+    from visthrow.training import session
     from visthrow.training.trainer import CHECKPOINT
 
     folder = source.folder(out)
     resume = (folder / CHECKPOINT).is_file()
     if folder.exists() and not resume:  # killed before its first checkpoint
         shutil.rmtree(folder)
-    options = {
-        "seed": source.seed,
-        "out": folder,
-        "minutes": minutes,
-        "checkpoint_every": checkpoint_every or None,
-        "resume": resume,
-        "device": device,
-        "set": source.changes,
-    }
+    args = Namespace(
+        config=source.config,
+        seed=source.seed,
+        out=str(folder),
+        start=None,
+        iterations=None,
+        minutes=minutes,
+        until=None,
+        evaluate_every=None,
+        checkpoint_every=checkpoint_every,
+        resume=resume,
+        device=device,
+        overrides=source.changes,
+        json=None,
+    )
     start = time.perf_counter()
     began = datetime.now(UTC).isoformat(timespec="seconds")
     status = 1
     try:
-        status = api.run("train", [source.config], options)
+        status = session.run(args)
         status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
     finally:
         piece = {
