@@ -246,7 +246,7 @@ def _gain(gain: Gain | None, named: Mapping[str, float]) -> Section:
     note = (
         f"Root mean square errors of {'whole windows' if gain.whole else predicted},"
         f" {gain.left_out} left out in {gain.folds} folds, the selection repeated in each"
-        f" ({', '.join(shares) or 'nothing in any'}). Interval: 95 %, jackknife over flights."
+        f" ({', '.join(shares) or 'nothing in any'}). Interval: 95 %, by the scatter of flights."
         f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
     )
     header = (

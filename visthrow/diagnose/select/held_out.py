@@ -158,13 +158,22 @@ def borne_out(
     """Return the part of what names promise on held-out flights that they bring there, with a 95 %
     interval.
 
-    A right size promises theta' I theta / 2 nats with a variance of twice that. It brings more, and
-    the part exceeds 1, where unnamed effects below their floors push the same way. The interval is
-    that of the flights' scatter (Student, over those that can tell), or of this chance where it is
-    wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
-    sizes that all flights gave, shape (K,)."""
+    A right size promises theta' I theta / 2 nats. It brings more, and the part exceeds 1, where
+    unnamed effects below their floors push the same way.
+
+    ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``: sizes that
+    all flights gave, shape (K,)."""
     promised = 0.5 * theta @ statistics.information @ theta
     brought = 0.5 * (statistics.absolute.square - statistics.about(trained).square)
+    return share_of(promised, brought)
+
+
+def share_of(promised: ndarray, brought: ndarray) -> tuple[float, float, float]:
+    """Return the part of promised nats that flights bring, with a 95 % interval; shape (F,) both.
+
+    A right size brings what it promises with a variance of twice that. The interval is that of the
+    flights' scatter about the part (Student, over those that can tell), or of this chance where it
+    is wider."""
     total = promised.sum()
     if total <= 0.0:
         return 0.0, np.nan, np.nan
@@ -190,15 +199,18 @@ def channel_gains(
     after = work.after
     names = work.problem.model.channels
     row = np.unique(groups, return_inverse=True)[1]
-    change = (after.theta - trained)[row] * work.problem.priors.floor
-    named = [w.residual + w.effects @ shift for w, shift in zip(after.windows, change)]
+    floors = work.problem.priors.floor
+    shifts = [w.effects @ size for w, size in zip(after.windows, trained[row] * floors)]
+    model = [w.residual + w.effects @ (after.theta * floors) for w in after.windows]
+    named = [residual - shift for residual, shift in zip(model, shifts)]
     plain = [w.residual for w in before.windows]
     left = errors(after.windows, groups, after.noise, named, len(names))
+    promised = errors(after.windows, groups, after.noise, shifts, len(names)).square
     earlier = errors(before.windows, groups, after.noise, plain, len(names)).square
     if box is None:
         box = np.full_like(earlier, np.nan)
-    # before, after, of noise alone, and of the black box, shape (4, F, C, H)
-    squares = np.stack((earlier, left.square, left.floor, box))
+    # before, after, of noise alone, of the black box, and of what the sizes change: (5, F, C, H)
+    squares = np.stack((earlier, left.square, left.floor, box, promised))
     gains = []
     for c, name in enumerate(names):
         count = left.count[:, c].sum(0)
@@ -209,13 +221,14 @@ def channel_gains(
 
 def _channel(name: str, sigma: float, count: ndarray, squares: ndarray) -> ChannelGain:
     """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums
-    before, after, of noise alone and of the black box by flight and horizon, shape (4, F, H).
+    before, after, of noise alone, of the black box and of what the sizes change, by flight and
+    horizon, shape (5, F, H).
     """
     by_flight = squares.sum(2)
     by_horizon = np.maximum(squares.sum(1), 0.0)
     totals = np.maximum(by_flight.sum(1), 0.0)
-    before, after, floor, box = (sigma * np.sqrt(totals / count.sum())).tolist()
-    value, low, high = jackknifed(by_flight[0], by_flight[1])
+    before, after, floor, box, _ = (sigma * np.sqrt(totals / count.sum())).tolist()
+    value, low, high = gain_of(by_flight[0], by_flight[1], by_flight[4])
     measured = count > 0
     curves = np.sqrt(by_horizon[:3, measured] / count[measured])
     rows = np.vstack((np.array(HORIZONS)[measured], curves)).T.tolist()
@@ -223,26 +236,24 @@ def _channel(name: str, sigma: float, count: ndarray, squares: ndarray) -> Chann
     return ChannelGain(name, unit_of(name), *errors_of, value, low, high, tuple(map(tuple, rows)))
 
 
-def jackknifed(before: ndarray, after: ndarray) -> tuple[float, float, float]:
-    """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the jackknife over groups.
+def gain_of(before: ndarray, after: ndarray, promised: ndarray) -> tuple[float, float, float]:
+    """Return the gain 1 - sqrt(sum after / sum before) with a 95 % interval.
 
-    ``before``: sums of squares by group, shape (F,).
+    Flights excite a cause unequally, and noise is left in each. So what counts is how far the fall
+    of a flight's squares is from the part of what the sizes promise there that all flights bring.
 
-    Source: Efron and Tibshirani 1993, ch. 11, on the logarithm of the ratio; Student's quantile.
+    Args:
+        before: sums of squares by flight, in sigmas, shape (F,).
+        after: those that held-out sizes leave, shape (F,).
+        promised: squares of what these sizes change, shape (F,).
     """
-    n = len(before)
-    old = before.sum()
-    new = after.sum()
-    if old <= 0.0 or new <= 0.0:
+    total = before.sum()
+    if total <= 0.0:
         return 0.0, np.nan, np.nan
-    value = np.log(new / old)
-    reach = np.nan
-    if n > 1:
-        with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
-            without = np.log((new - after) / (old - before))
-        variance = (n - 1.0) / n * ((without - without.mean()) ** 2).sum()
-        reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt(variance)
-    return tuple(1.0 - np.exp(0.5 * value + side) for side in (0.0, reach, -reach))
+    fall = before - after
+    _, low, high = share_of(0.5 * promised, 0.5 * fall)
+    remaining = 1.0 - np.array([fall.sum(), low * promised.sum(), high * promised.sum()]) / total
+    return tuple((1.0 - np.sqrt(np.maximum(remaining, 0.0))).tolist())
 
 
 def measure(diagnosis: Diagnosis) -> HeldOut:

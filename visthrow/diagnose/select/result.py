@@ -140,7 +140,7 @@ class ChannelGain:
     floor: float  # of sensor noise and of the initial state's uncertainty
     blackbox: float  # NaN where none can be, or was, trained
     gain: float  # 1 - after / before
-    low: float  # 95 % interval of the gain, by the jackknife over flights; NaN where one has all
+    low: float  # 95 % interval of the gain, by the scatter of flights; NaN where one has all
     high: float
     # horizon [s], before, after, floor, in sigmas
     horizons: tuple[tuple[float, float, float, float], ...]
