@@ -7,24 +7,8 @@ import numpy as np
 from pytest import approx, mark
 
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, explain_without_laws
-from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.reporting.diagnosis_report import instead
 from visthrow.diagnose.select import candidates, held_out, result, verdicts
-
-
-def promised(nats, came):
-    """Share and interval of flights that promise and bring so many nats by one effect of a size of
-    1.
-    """
-    information = 2.0 * np.array(nats, dtype=float)[:, None, None]
-    score = (np.array(came, dtype=float) + np.array(nats))[
-        :, None
-    ]  # came = score - information / 2
-    count = len(nats)
-    statistics = Statistics(
-        np.arange(count), information, score, np.zeros(count), np.ones(count), np.zeros(1)
-    )
-    return held_out.borne_out(statistics, np.ones((count, 1)), np.ones(1))
 
 
 @mark.parametrize(
@@ -46,7 +30,7 @@ def promised(nats, came):
     ],
 )
 def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
-    share, low, _ = promised(nats, came)
+    share, low, _ = held_out.share_of(np.array(nats), np.array(came))
     assert share == approx(sum(came) / sum(nats))
     assert (low > 0.0) == sure
 
@@ -108,21 +92,31 @@ def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(m
 
 
 def test_intervals_of_the_gain_hold_what_they_promise():
-    """Ratios of sums over ten flights, whose sizes and gains are lognormal."""
+    """Four flights that excite a cause unequally, each of which has a size of its own."""
     rng = np.random.default_rng(0)
-    before = rng.lognormal(0.0, 0.5, (200, 10))
-    after = before * 0.25 * rng.lognormal(-0.5 * 0.4**2, 0.4, before.shape)
+    excited = rng.lognormal(6.0, 1.0, (400, 4))
+    noise = rng.normal(1500.0, 150.0, (2, 400, 4))  # drawn anew, for what it adds to the fall
+    before = excited * rng.normal(1.0, 0.2, excited.shape) + noise[0]
     inside = 0
-    for errors in zip(before, after):
-        _, low, high = held_out.jackknifed(*errors)
-        inside += low < 1.0 - np.sqrt(0.25) < high
-    assert 0.88 < inside / len(before) < 0.995
+    for promised, old, new in zip(excited, before, noise[1]):
+        _, low, high = held_out.gain_of(old, new, promised)
+        inside += low < 1.0 - np.sqrt(1.0 - promised.sum() / old.sum()) < high
+    assert 0.92 < inside / len(before) < 0.995
+
+
+@mark.parametrize(("left", "sure"), [(1570.0, True), (9000.0, False)])
+def test_flights_that_excite_a_cause_unequally_confirm_it_where_they_agree(left, sure):
+    """Recorded sums of squares: a flight falls as the size promises, or is far worse."""
+    before = np.array([4850.5, 4876.6, 2241.5, 30308.6])
+    after = np.array([left, 1453.8, 2277.7, 1523.1])
+    promised = np.array([3861.6, 4273.4, 342.2, 27537.8])
+    assert (held_out.gain_of(before, after, promised)[1] > 0.0) == sure
 
 
 def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
     """One flight alone holds it, such as a payload that was tracked once."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
-    _, low, high = held_out.jackknifed(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    _, low, high = held_out.gain_of(*np.array([[30.0, 0, 0], [10.0, 0, 0], [20.0, 0, 0]]))
     once = replace(GAIN, channel="one", low=low, high=high)
     often = replace(once, channel="often", low=0.3, high=0.6)
     assert (once.interval, often.interval) == ("[no interval]", "[30, 60]")
