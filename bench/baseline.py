@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from bench import start
-from visthrow.paper import RECORDS
+from visthrow.paper import RECORDS, results
 from visthrow.paper.baseline import front, thrower
 from visthrow.paper.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.paper.baseline.thrower import BOUNDS
 from visthrow.task.measurement import TARGETS
-from visthrow.throws import results
 
 
 def full() -> list[dict[str, Any]]:

@@ -40,11 +40,11 @@ from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.diagnose.apply.patch import extended
 from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.paper.results import DIGITS
 from visthrow.task import Experiment, load_experiment
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.recorded import fly
 from visthrow.throws.reference_protocol import Throwing
-from visthrow.throws.results import DIGITS
 
 PLANT = "reference"
 """The reference plant without extras: the diagnosis finds the hidden effect, or is wrong."""
@@ -420,7 +420,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
 
 def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
     """Mean landing errors with intervals, a group a loop, as PNG."""
-    from visthrow.view.figures import Mark, marks
+    from visthrow.paper.report.charts import Mark, marks
 
     rows = [
         Mark(hidden_text(r), statistics.mean(1e3 * landed(r["throws"][name])), WHO.index(name))

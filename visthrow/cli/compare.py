@@ -16,7 +16,7 @@ from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write, writable, write_json
 from visthrow.common.workers import status
 from visthrow.onboard.shipped import find_policy
-from visthrow.throws.results import Entry
+from visthrow.task.measurement import Entry
 
 BASELINE = "baseline"  # trajectory optimisation and MPC, beside the policies
 DEFAULT_POLICIES = ("state", "vision")

@@ -185,16 +185,3 @@ def bias(groups: Groups | ndarray) -> Bias:
     along, lateral = (_interval(center[i], samples[:, i]) for i in range(2))
     scatter = float(np.sqrt(max(square - offset**2, 0.0)))
     return Bias(along, lateral, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
-
-
-def pareto(points: ndarray) -> ndarray:
-    """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
-    first coordinate.
-    """
-    front = []
-    best = np.inf
-    for i in np.lexsort((points[:, 1], points[:, 0])):
-        if points[i, 1] < best:
-            front.append(int(i))
-            best = points[i, 1]
-    return np.array(front, dtype=int)

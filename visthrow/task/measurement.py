@@ -5,6 +5,7 @@ Landing error is the horizontal distance of the landing point from the goal, dur
 the policy's start to the landing (Sec. IV-A). A throw succeeds when the payload was released and
 landed; one that ends otherwise has no landing error and counts against the success rate."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,3 +100,14 @@ class Throws:
             "clearance_min": float(self.clearance[good].min()),
             "smoothness": float(self.smoothness[good].mean()),
         }
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws
+    a target.
+    """
+
+    name: str
+    layout: str
+    throws: Sequence

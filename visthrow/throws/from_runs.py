@@ -11,8 +11,7 @@ from visthrow.common.errors import LogError
 from visthrow.logs import RUN_TICKS
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.observations import VEHICLE
-from visthrow.task.measurement import Throws
-from visthrow.throws.results import Entry
+from visthrow.task.measurement import Entry, Throws
 
 PATTERN = "throw-*.npz"
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from visthrow.paper import results
 from visthrow.paper.report.result_set import SHIPPED, ResultSet
+from visthrow.paper.results import Result
 from visthrow.task.measurement import TARGETS
-from visthrow.throws import results
-from visthrow.throws.results import Result
 
 MADE = {
     "commit": "0" * 40,

@@ -9,7 +9,7 @@ from pytest import approx, fixture, importorskip, mark
 
 from tests.commands import run_command
 from tests.configs import load_experiment
-from visthrow.common.statistics import pareto
+from visthrow.paper import results
 from visthrow.paper.baseline import front
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.fly_plan import (
@@ -17,11 +17,11 @@ from visthrow.paper.baseline.fly_plan import (
     delays_of,
     fly_pendulum,
 )
+from visthrow.paper.baseline.front import pareto
 from visthrow.paper.baseline.mpc import MPC, MPCParams
 from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import plan_throw
 from visthrow.task import Experiment, plant_of
-from visthrow.throws import results
 
 importorskip("piqp")
 

@@ -11,11 +11,11 @@ from pytest import approx, fixture
 from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.common.statistics import Interval
+from visthrow.paper import results
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, gap, result_set, throws
-from visthrow.throws import results
-from visthrow.throws.results import Result
-from visthrow.view import figures, page
+from visthrow.paper.report import ablations, charts, gap, result_set, throws
+from visthrow.paper.results import Result
+from visthrow.view import page
 from visthrow.view.parts import Grid, Picture, Text
 
 
@@ -175,13 +175,13 @@ def test_pictures_show_what_they_are_given():
 
     def drawn(scale: float) -> list[bytes]:
         size = Interval(scale, 0.9 * scale, 1.1 * scale)
-        first = figures.Line("a", [1.0, 2.0], [size, size], trained_at=0)
-        other = figures.Line("b", [1.0, 2.0], [size, size], series=1)
-        panels = [figures.Panel("both", "x", (first, other)), figures.Panel("none", "x", ())]
+        first = charts.Line("a", [1.0, 2.0], [size, size], trained_at=0)
+        other = charts.Line("b", [1.0, 2.0], [size, size], series=1)
+        panels = [charts.Panel("both", "x", (first, other)), charts.Panel("none", "x", ())]
         points = scale * np.array([[1.0, 0.2], [2.0, 0.1]])
-        trade = figures.Trade("t", ((0, "f", points),), (("s", size, size),), (("c", points),))
+        trade = charts.Trade("t", ((0, "f", points),), (("s", size, size),), (("c", points),))
         runs = [("g", [points.T])]
-        curves = [figures.curves(panels, "y", log) for log in (False, True)]
-        return [*curves, figures.trades([trade]), figures.learning(runs)]
+        curves = [charts.curves(panels, "y", log) for log in (False, True)]
+        return [*curves, charts.trades([trade]), charts.learning(runs)]
 
     assert all(one != other for one, other in zip(drawn(1.0), drawn(1.5), strict=True))

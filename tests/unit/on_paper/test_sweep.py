@@ -16,12 +16,12 @@ from tests.waiting import eventually
 from visthrow import config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
+from visthrow.paper import results
 from visthrow.paper.sweep import pool
 from visthrow.paper.sweep import work_units as units
 from visthrow.paper.sweep.sweep_record import collect, status
 from visthrow.paper.sweep.work import held, locked
 from visthrow.paper.sweep.work_units import load_list
-from visthrow.throws import results
 
 LIST = """
 changes = ["ppo.iterations=2", "ppo.environments=8", "ppo.hidden=[8]"]

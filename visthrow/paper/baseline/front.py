@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from visthrow.common.statistics import pareto
-
 SPEEDS = (1.7, 2.2, 2.5, 2.9)  # release speeds of the sweep [m/s]; the paper's are 1.7 and 2.2
 
 WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3))
@@ -13,6 +11,19 @@ FRONT_TARGET = 2.0  # target of the sweep (the paper, Table IV) [m]
 FRONT_THROWS = 10  # throws of a setting, as in the paper
 
 CORNER = (2.5, 0.5)  # duration [s] and landing error [m] that hypervolumes are measured from
+
+
+def pareto(points: np.ndarray) -> np.ndarray:
+    """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
+    first coordinate.
+    """
+    front = []
+    best = np.inf
+    for i in np.lexsort((points[:, 1], points[:, 0])):
+        if points[i, 1] < best:
+            front.append(int(i))
+            best = points[i, 1]
+    return np.array(front, dtype=int)
 
 
 def hypervolume(points: np.ndarray, corner: tuple[float, float] = CORNER) -> float:

@@ -7,9 +7,8 @@ import piqp  # noqa: F401  needed by every worker: a missing package is an error
 
 from visthrow.common.workers import status
 from visthrow.paper.baseline import thrower
-from visthrow.task.measurement import Throws
+from visthrow.task.measurement import Entry, Throws
 from visthrow.throws.reference_protocol import FIELDS
-from visthrow.throws.results import Entry
 
 
 def throw_baseline(args: argparse.Namespace) -> list[Entry]:

@@ -17,9 +17,9 @@ from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
 from visthrow.paper.baseline.pendulum_model import pendulum_of
 from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_throw
+from visthrow.paper.results import PROTOCOL, Result, Unit, columns_of, join, key_of, work
 from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.throws.reference_protocol import batches
-from visthrow.throws.results import PROTOCOL, Result, Unit, columns_of, join, key_of, work
 
 IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
     "pendulum"

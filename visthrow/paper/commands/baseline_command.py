@@ -28,10 +28,10 @@ def run(args: argparse.Namespace) -> int:
     """Plan, throw, print, write."""
     from visthrow.cli import compare
     from visthrow.common.storage import writable
+    from visthrow.paper import results
     from visthrow.paper.baseline import thrower
     from visthrow.paper.report import result_set, trade
     from visthrow.paper.report.result_set import SHORT
-    from visthrow.throws import results
     from visthrow.throws.plants import check_plant
     from visthrow.view import page
     from visthrow.view.parts import Section
@@ -131,8 +131,8 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
 def _throw(name: str, args: argparse.Namespace) -> Any:
     """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
     from visthrow.cli.compare import throw_hybrid
+    from visthrow.paper import results
     from visthrow.paper.baseline.front import FRONT_TARGET
-    from visthrow.throws import results
     from visthrow.throws.loading import load_policy
 
     loaded = load_policy(name)

@@ -6,8 +6,9 @@ import math
 from itertools import product
 
 from visthrow.common import statistics as st
+from visthrow.paper.report import charts
 from visthrow.paper.report.result_set import ANY, SHORT, WORDS, ResultSet, cells, errors
-from visthrow.throws.results import Result
+from visthrow.paper.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER_ABLATIONS
@@ -70,7 +71,7 @@ def section(thrown: ResultSet) -> Section:
                 ratio = st.ratio(errors(trainings), errors(full))
                 rows.append(_row(variant, trainings) | {"ratio to full": ratio.text(2)})
                 paper = None if series else paper_ratio(variant)
-                marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
+                marks.append(charts.Mark(TITLES[variant], ratio, series, paper))
                 if not series:
                     sentences.append(_sentence(variant, ratio, trainings))
             elif layout == "state" or variant in PAPER_FOUR:
@@ -80,7 +81,7 @@ def section(thrown: ResultSet) -> Section:
     picture = None
     if marks:
         series = [f"{a},\n{SHORT[b]}" for a, b in product(SHORT_LAYOUT.values(), PLANTS)]
-        chart = figures.marks(
+        chart = charts.marks(
             marks, "mean landing error over the full model's", series, zero=1.0, log=True
         )
         text = (

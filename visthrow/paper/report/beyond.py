@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy import ndarray
 
+from visthrow.paper.report import charts
 from visthrow.paper.report.result_set import (
     SHIPPED,
     SHORT,
@@ -18,8 +19,8 @@ from visthrow.paper.report.result_set import (
     cells,
     line,
 )
-from visthrow.throws.results import Result
-from visthrow.view import figures, parts
+from visthrow.paper.results import Result
+from visthrow.view import parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 TARGET = 2.0
@@ -119,7 +120,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
             rows += [{**cells(r), "speed [m/s]": f"{speed:g}"} for speed, r in points]
     content: list = []
     if lines:
-        panel = figures.Panel(
+        panel = charts.Panel(
             "targets that move, from 2.0 m ahead in any direction",
             "speed of the target [m/s]",
             tuple(lines),
@@ -128,7 +129,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
             "Landing error against where the target is at impact, in the training simulator; bands"
             " are 95 % intervals."
         )
-        content.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
+        content.append(Picture("moving", charts.curves([panel], "landing error [m]"), text))
     header = "policy | plant | speed [m/s] | throws | landed | landing error [m]"
     return [*content, Grid.from_rows("Moving targets", header, rows)]
 
@@ -160,7 +161,7 @@ def training_section(thrown: ResultSet) -> Section:
             "Landing error of the training's own throws, random starts and goals, over environment"
             " steps; a colour a seed."
         )
-        picture = Picture("learning", figures.learning(list(groups.items())), text)
+        picture = Picture("learning", charts.learning(list(groups.items())), text)
     header = (
         "run | seed | million steps | pieces | time [s] | final error [m] | final duration [s]"
         " | device | commit"

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from visthrow.common import statistics as st
+from visthrow.paper.report import charts
 from visthrow.paper.report.result_set import (
     ANY,
     SHIPPED,
@@ -20,7 +21,7 @@ from visthrow.paper.report.result_set import (
     errors,
     line,
 )
-from visthrow.view import figures, parts
+from visthrow.view import parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 PLANT = "hybrid"
@@ -60,7 +61,7 @@ def section(thrown: ResultSet) -> Section:
                 rows += _rows(sweep, points)
         if not lines:
             missing.append(sweep.title)
-        panels.append(figures.Panel(sweep.title, sweep.xlabel, tuple(lines), "not thrown yet"))
+        panels.append(charts.Panel(sweep.title, sweep.xlabel, tuple(lines), "not thrown yet"))
     content = [
         Text(
             "The shipped policies are flown in the training simulator at 2.0 m with one value"
@@ -75,7 +76,7 @@ def section(thrown: ResultSet) -> Section:
             "imperfection | value | policy | throws | landed | landing error [m]"
             " | added to its own [m]"
         )
-        curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
+        curves = Picture("gap", charts.curves(panels, "landing error [m]", log=True), text)
         content += [curves, Grid.from_rows("The curves in figures", header, rows)]
     return parts.section(
         "gap",
@@ -125,7 +126,7 @@ def _list_trained(thrown: ResultSet, missing: list[str]) -> list:
         if not results:
             missing.append(f"trained with {title} ({SHORT[plant]})")
             continue
-        marks.append(figures.Mark(title, st.mean(errors(results)), series))
+        marks.append(charts.Mark(title, st.mean(errors(results)), series))
         row = cells(*results) | {"trained with": title}
         if variant != "full" and full:
             row["ratio to full"] = st.ratio(errors(results), errors(full)).text(2)
@@ -138,7 +139,7 @@ def _list_trained(thrown: ResultSet, missing: list[str]) -> list:
         " one training."
     )
     axis = "landing error at 2.0 m [m]"
-    picture = figures.marks(marks, axis, [SHORT[plant] for plant in plants])
+    picture = charts.marks(marks, axis, [SHORT[plant] for plant in plants])
     return [
         Picture("gap_trained", picture, text),
         Grid.from_rows("Trained with other sight", header, rows),

@@ -13,8 +13,8 @@ from visthrow.common import statistics as st
 from visthrow.common.errors import StorageError
 from visthrow.common.toml_text import tables_beside
 from visthrow.paper import RECORDS
-from visthrow.throws.results import PROTOCOL, Result, join, load_all
-from visthrow.view.figures import Line
+from visthrow.paper.report.charts import Line
+from visthrow.paper.results import PROTOCOL, Result, join, load_all
 
 SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the package
 

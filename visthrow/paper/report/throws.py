@@ -5,10 +5,11 @@ from itertools import product
 
 from visthrow.common import statistics as st
 from visthrow.paper.baseline.front import FRONT_TARGET
+from visthrow.paper.report import charts
 from visthrow.paper.report.result_set import SHIPPED, SHORT, ResultSet, cells
+from visthrow.paper.results import Result
 from visthrow.task.measurement import TARGETS
 from visthrow.throws.plants import PLANTS
-from visthrow.throws.results import Result
 from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text, section
 from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
@@ -108,7 +109,7 @@ def vision_section(thrown: ResultSet) -> Section:
         figures_of_pair = (gap.text(sign=True), _sentence(gap), faster.text(sign=True), comparison)
         rows.append((SHORT[plant], f"{target:.1f}", runs, *figures_of_pair))
         reference = None if paper is None or i else paper[0]
-        marks.append(figures.Mark(f"{target:.1f} m", gap, i, reference))
+        marks.append(charts.Mark(f"{target:.1f} m", gap, i, reference))
     parts = [
         Text(
             "Vision minus state: positive means that vision lands further off. Where several"
@@ -123,7 +124,7 @@ def vision_section(thrown: ResultSet) -> Section:
             " | duration: vision - state [s] | the paper's: error [m], duration [s]"
         )
         axis = "landing error, vision minus state [m]"
-        picture = figures.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
+        picture = charts.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
         text = "Difference of mean landing errors with 95 % intervals; left: vision lands nearer."
         parts += [
             Grid.from_rows("Vision against state", header, rows),

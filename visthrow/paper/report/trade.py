@@ -13,10 +13,11 @@ from visthrow.paper import measurements
 from visthrow.paper.baseline import front, thrower
 from visthrow.paper.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.paper.baseline.thrower import BOUNDS
+from visthrow.paper.report import charts
 from visthrow.paper.report.result_set import SHIPPED, SHORT, WORDS, ResultSet, cells, landed
+from visthrow.paper.results import Result
 from visthrow.task.measurement import TARGETS
-from visthrow.throws.results import Result
-from visthrow.view import figures, parts
+from visthrow.view import parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.tables import PAPER, PAPER_FRONT, of_paper
 
@@ -171,7 +172,7 @@ def front_section(
             " baseline's known delays are made up for, except where the legend says otherwise."
             " Crosses and grey stars are the paper's."
         )
-        picture = Picture("front", figures.trades(panels), text)
+        picture = Picture("front", charts.trades(panels), text)
     header = (
         "plant | what | settings | all landed | fastest [s] | most accurate [m]"
         " | hypervolume [s m] | correlation of landing error with e_v"
@@ -208,7 +209,7 @@ def _panel(
     plant: str,
     kinds: Sequence[Sequence[str]],
     policies_on: str,
-) -> figures.Trade:
+) -> charts.Trade:
     """Return the panel of a row of :data:`PANELS`, fronts, policies and the paper's points; add its
     sentences, its sums, what it lacks.
     """
@@ -235,7 +236,7 @@ def _panel(
         sums.append(_policy_sum(title, name, result))
         duration, error = (st.mean(result.of(column)) for column in ("duration", "error"))
         stars.append((f"{name} policy", duration, error))
-    return figures.Trade(heading, tuple(fronts), tuple(stars), _paper_points() if ideal else ())
+    return charts.Trade(heading, tuple(fronts), tuple(stars), _paper_points() if ideal else ())
 
 
 def _swept(selected: Sequence[Result]) -> list[Result]:

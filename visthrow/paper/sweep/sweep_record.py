@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.errors import StorageError
+from visthrow.paper import results
 from visthrow.paper.report.result_set import runs_of
 from visthrow.paper.sweep.work import PIECES, held, lock_of
 from visthrow.paper.sweep.work_units import (
@@ -19,7 +20,6 @@ from visthrow.paper.sweep.work_units import (
     throws_folder,
     variant_of,
 )
-from visthrow.throws import results
 
 CURVE_POINTS = 60  # points of a run's learning curve in the record
 

@@ -22,8 +22,8 @@ import torch
 from visthrow.common import provenance
 from visthrow.common.errors import BusyError
 from visthrow.common.storage import write_json
+from visthrow.paper import results
 from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit, throws_folder
-from visthrow.throws import results
 from visthrow.throws.loading import Loaded, load_policy
 
 PIECES = "pieces"  # folder of a run with one file a piece

@@ -3,7 +3,7 @@ done.
 
 A training run is known by a hash of its resolved config, its seed and, where the list asks for it,
 the commit: a changed config is another run, and its folder another folder. Throws are known as
-:mod:`visthrow.throws.results` knows them, by all that they depend on, the policy file's content
+:mod:`visthrow.paper.results` knows them, by all that they depend on, the policy file's content
 included."""
 
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.onboard.policy import find_policy
+from visthrow.paper import results
 from visthrow.paper.sweep import Changes, SweepList, ThrowParams
 from visthrow.task import Experiment, load_experiment
-from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
 
 FULL = {"state": "state", "vision": "vision_ideal"}
@@ -93,7 +93,7 @@ class ThrowUnit:
         return f"{self.source.id}:{self.set}:{self.target:g}{place}"
 
     def unit(self, out: Path) -> results.Unit:
-        """Return the key of :mod:`visthrow.throws.results`; the policy must exist."""
+        """Return the key of :mod:`visthrow.paper.results`; the policy must exist."""
         source = self.source
         params = self.params
         path = source.policy(out)

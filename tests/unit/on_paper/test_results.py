@@ -4,7 +4,7 @@ import numpy as np
 from pytest import approx, mark, raises
 
 from visthrow.common.errors import StorageError
-from visthrow.throws import results
+from visthrow.paper import results
 
 
 def unit(number: int = 0) -> dict:

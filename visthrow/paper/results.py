@@ -72,17 +72,6 @@ class Result:
         return self.of("landing_w") - goal
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws
-    a target.
-    """
-
-    name: str
-    layout: str
-    throws: Sequence
-
-
 def key_of(unit: Unit) -> str:
     """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
     return _digest(json.dumps(unit, sort_keys=True, allow_nan=False).encode())
