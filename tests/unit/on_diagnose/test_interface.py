@@ -112,7 +112,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
     wrong = [changed(log, both) for log in flights]
     if not change:  # as a relation by chance would have it
-        turned = interface._rows(np.diag([1.0, 1.0, 1.0, -1.0]))
+        turned = np.diag([1.0, 1.0, 1.0, -1.0]).tolist()
         monkeypatch.setattr(
             interface,
             "suspected",

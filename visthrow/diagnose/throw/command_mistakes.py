@@ -13,7 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy import ndarray
 
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded_flight import measured
@@ -21,6 +20,7 @@ from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust_checks
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import Samples
+from visthrow.logs.unit_names import nearest
 
 # correlation of commanded and measured rates, with whichever axes, from which a log tells of its
 # commands
@@ -42,9 +42,8 @@ class Mistake:
     nats: float  # by which it beats the log as it stands
     logs: int  # that can tell
     ways: int = 1  # that commands may be wrong in so: their logarithm is the price
-    change: tuple[
-        tuple[float, ...], ...
-    ] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
+    # of the command (thrust and rates), shape (4, 4); none where it was made anew
+    change: Sequence[Sequence[float]] = ()
 
     @property
     def sentence(self) -> str:
@@ -178,24 +177,26 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
     change[1:, 1:] = matrix_of(text)
     nats = sum(r.nats for r in clear)
     equation = f"x, y, z of the vehicle are ({text}) of the command"
-    return Mistake(*words, equation, nats, len(clear), len(EXCHANGES), _rows(change))
+    return Mistake(*words, equation, nats, len(clear), len(EXCHANGES), change.tolist())
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     """Degrees for radians, or radians for degrees, in the commanded rates."""
     gain = np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0])
-    words = {
-        1.0: "",
-        np.pi / 180.0: "degrees a second",
-        180.0 / np.pi: "radians that were converted twice",
+    factors = {
+        "radians a second": 1.0,
+        "degrees a second": np.pi / 180.0,
+        "radians that were converted twice": 180.0 / np.pi,
     }
-    factor = min(words, key=lambda f: abs(np.log(gain / f))) if gain > 0.0 else 1.0
+    unit, _ = nearest(1.0 / gain, factors)
+    factor = factors[unit]
     if factor == 1.0:
         return None
     change = np.diag([1.0, factor, factor, factor])
-    cause = f"Commanded rates are in {words[factor]}"
+    cause = f"Commanded rates are in {unit}"
     equation = f"rates times {factor:.5g}"
-    return Mistake("rate_unit", cause, equation, 0.0, len(relation), len(words), _rows(change))
+    numbers = len(relation), len(factors)
+    return Mistake("rate_unit", cause, equation, 0.0, *numbers, change.tolist())
 
 
 def _thrust_unit(
@@ -209,14 +210,11 @@ def _thrust_unit(
     ratio = np.median(medians) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:
         return None
-    unit = min(units, key=lambda unit: abs(np.log(ratio * units[unit])))
+    unit, _ = nearest(ratio, units)
     if unit == "N":
         return None
     change = np.diag([units[unit], 1.0, 1.0, 1.0])
     cause = f"Commanded thrust is in {unit}"
     equation = f"thrust times {units[unit]:.5g}"
-    return Mistake("thrust_unit", cause, equation, 0.0, len(medians), len(units), _rows(change))
-
-
-def _rows(matrix: ndarray) -> tuple[tuple[float, ...], ...]:
-    return tuple(map(tuple, matrix.tolist()))
+    numbers = len(medians), len(units)
+    return Mistake("thrust_unit", cause, equation, 0.0, *numbers, change.tolist())

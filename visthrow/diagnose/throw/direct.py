@@ -71,9 +71,10 @@ def direct_samples(
     counting = [(w, c) for w, c in enumerate(cuts) if c.retained]
     last = {c.flight: w for w, c in counting}
     by_window = defaultdict(list)
-    for n, flight in enumerate(flights):
-        if flight.landing_point is not None and flight.latch != NEVER and n in last:
-            by_window[last[n]].append(_landing(flight.landing, flight.landing_point))
+    for n, w in last.items():
+        flight = flights[n]
+        if flight.landing_point is not None and flight.latch != NEVER:
+            by_window[w].append(_landing(flight.landing, flight.landing_point))
     for w, c in counting if setting.camera is not None else ():
         flight = flights[c.flight]
         if flight.payload is not None and has_camera_keypoints(logs[c.flight]):

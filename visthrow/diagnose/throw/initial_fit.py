@@ -206,7 +206,6 @@ class InitialFit:
             done = states[MOVED][rows]
             steps, promised = zip(*parallel_map(_WindowFit.increment, remaining, done))
             trial = moved_along(rows_of(states, rows), self.directions, np.array(steps))
-            trial[MOVED] = trial[MOVED] + steps
             flown = self._residuals(trial, remaining)
             helps = np.array(list(map(_WindowFit.judge, remaining, flown, promised)))
             for name, value in states.items():
@@ -226,12 +225,11 @@ class InitialFit:
         """Take the derivatives of windows' samples by their initial states."""
         if not fits:
             return
-        ways = sorted({d for fit in fits for d in fit.free})
         groups = []
         for row, fit in enumerate(fits):
-            rows = [row, *[(1 + ways.index(d)) * len(fits) + row for d in fit.free]]
+            rows = [row, *[(1 + d) * len(fits) + row for d in fit.free]]
             groups.append([Lane(fit.number, 0, row_moved, rough=True) for row_moved in rows])
-        moved = perturbed(rows_of(states, _numbers(fits)), [self.directions[d] for d in ways])
+        moved = perturbed(rows_of(states, _numbers(fits)), self.directions)
         changes = self.flights.differences(self.simulation, moved, groups, self._shortened)
         for fit, change in zip(fits, changes):
             steps = np.array([self.directions[d].step for d in fit.free])

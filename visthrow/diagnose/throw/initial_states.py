@@ -133,10 +133,10 @@ def _tangents(n: ndarray) -> ndarray:
 
 
 def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray) -> States:
-    """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope
-    before its rates.
+    """States moved further along all directions by ``sizes``, shape (S, directions); directions of
+    the rope before its rates.
     """
-    out = dict(states)
+    out = {**states, MOVED: states[MOVED] + sizes}
     for field in dict.fromkeys(direction.field for direction in directions):
         members = [d for d, direction in enumerate(directions) if direction.field == field]
         axes = [directions[d].axis for d in members]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
+from numpy.linalg import norm
 
 from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.throw.cutting import (
@@ -23,7 +24,7 @@ from visthrow.diagnose.throw.cutting import (
     payload_down,
 )
 from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
-from visthrow.diagnose.throw.replay import Lane
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -50,21 +51,25 @@ class PredictedLandings:
         """Horizontal distance of the open-loop prediction from the measured landing [m], shape
         (F,).
         """
-        return self._distance(self.predicted)
+        return norm(self.off, axis=1)
 
     @property
     def released_errors(self) -> ndarray:
         """Return the errors of the prediction from the separation [m], shape (F,)."""
-        return self._distance(self.released)
+        return norm((self.released - self.measured)[:, :2], axis=1)
+
+    @property
+    def off(self) -> ndarray:
+        """Return the open-loop prediction less the measured landing along world x and y [m], shape
+        (F, 2).
+        """
+        return (self.predicted - self.measured)[:, :2]
 
     @classmethod
     def join(cls, parts: Iterable["PredictedLandings"]) -> "PredictedLandings":
         """Join the landings of several predictions."""
         columns = zip(*(vars(part).values() for part in parts))
         return cls(*map(np.concatenate, columns))
-
-    def _distance(self, points: ndarray) -> ndarray:
-        return np.linalg.norm((points - self.measured)[:, :2], axis=1)
 
 
 def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndarray] | None:
@@ -157,7 +162,7 @@ def _fly(
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
     looked = [_extend_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
-    onward = model.cut_into(looked, flown)
+    onward = ReplayedFlights(looked, flown, model.setting)
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     measured = onward.fly(model.simulation(setting), states, lanes).samples
     points = []

@@ -15,10 +15,9 @@ from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.law_terms import add_cable
+from visthrow.diagnose.models.law_terms import describe_knots
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
-from visthrow.diagnose.throw.recorded_flight import NEVER
 from visthrow.diagnose.throw.replay import (
     KNOT_SPACING,
     Lane,
@@ -144,25 +143,19 @@ class Linearisation:
         return parallel_map(window, plans, channels)
 
     def _plan(self, w: int, first: int, first_knot: int) -> Plan:
-        """Plan the lanes of one window: nominal, those that ride along, those of nominal steps;
-        rough nominal, the others.
+        """Plan the lanes of one window: nominal, those that ride along; rough nominal, the others.
 
         ``first``: number of the first; ``first_knot``: first row of the knots; twice as many as the
         window's are taken."""
         c = self._flights.cuts[w]
         knots = int(self._flights.knots[w])
         alike = self._alike[self._flights.kind(w)]
+        riders = np.flatnonzero(alike)
+        rough_nominal = 1 + len(riders)
         fine = alike | self._exact | c.after_slack
         states = np.flatnonzero(self._deviations[w])
         axes = 6 if c.payload == NO_PAYLOAD else 9
         latents = np.stack(np.mgrid[:axes, :knots], axis=-1).reshape(-1, 2)
-        # 0: rides along, 1: of nominal steps, 2: of longer ones
-        of_effects = np.where(alike, 0, np.where(fine, 1, 2))
-        of_states = np.full(len(states), 1 if c.after_slack else 2)
-        of_latents = np.full(len(latents), 2)
-        group = np.concatenate((of_effects, of_states, of_latents))
-        rough_first = 1 + np.count_nonzero(group < 2)
-        order = np.argsort(group, kind="stable")
         windows = len(self._flights.cuts)
         columns = [Lane(w, 1 + k, w, rough=not x) for k, x in enumerate(fine)]
         for d in states.tolist():
@@ -170,16 +163,19 @@ class Linearisation:
         for axis, knot in latents.tolist():
             resume = first_knot + knots + max(knot - 1, 0)
             force = axis, knot, LATENT_SIZES[axis]
-            parent = first + rough_first
+            parent = first + rough_nominal
             columns.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
-        lanes = [Lane(w, 0, w, keep=first_knot, shared=int(alike.sum()))]
-        lanes += [columns[i] for i in order]
-        lanes.insert(rough_first, Lane(w, 0, w, keep=first_knot + knots, rough=True))
-        rough = group == 2
-        place = np.argsort(order) + 1 + rough
+        others = np.setdiff1d(np.arange(len(columns)), riders)
+        lanes = [Lane(w, 0, w, keep=first_knot, shared=len(riders))]
+        lanes += [columns[i] for i in riders]
+        lanes.append(Lane(w, 0, w, keep=first_knot + knots, rough=True))
+        lanes += [columns[i] for i in others]
+        place = np.zeros(len(columns), dtype=int)
+        place[riders] = 1 + np.arange(len(riders))
+        place[others] = 1 + rough_nominal + np.arange(len(others))
+        nominal = np.array([rough_nominal * lane.rough for lane in columns])
         latent_steps = np.array(LATENT_SIZES)[latents[:, 0]]
         steps = np.concatenate((self._steps, self._state_steps[states], latent_steps))
-        nominal = rough_first * rough
         return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
     def _slopes(self, samples: ndarray, plan: Plan) -> ndarray:
@@ -237,15 +233,11 @@ def at_knots(
 ) -> dict[str, ndarray]:
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]
-    time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
-    values = {name: value.copy() for name, value in knots.items()}
-    values["time"] = np.minimum(time, c.end)
-    if c.payload == NO_PAYLOAD:
-        for name in ("payload_pos_w", "payload_vel_w", "tension"):
-            del values[name]
-        return values
-    add_cable(values, np.subtract(setting.plant.rope.mount, setting.plant.vehicle.body.com))
-    f = flights.flights[c.flight]
-    if f.latch != NEVER:
-        values["tension"][values["time"] > f.latch + setting.plant.release.lag] = 0.0
-    return values
+    time = np.minimum(c.start + KNOT_SPACING * np.arange(len(knots["thrust"])), c.end)
+    flown = {name: value.copy() for name, value in knots.items()}
+    plant = setting.plant
+    mount = None
+    if c.payload != NO_PAYLOAD:
+        mount = np.subtract(plant.rope.mount, plant.vehicle.body.com)
+        flown["tension"][time > flights.flights[c.flight].latch + plant.release.lag] = 0.0
+    return describe_knots(flown, time, mount)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy import ndarray
 
 from sim.effects.setting import Setting
-from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
+from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
 from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.initial_states import (
@@ -146,15 +146,19 @@ class ReplayedFlights:
         self._fineness = np.array([FINENESS.get(c.phase, (1.0, 1.0)) for c in cuts])
         self.samples = [self._samples_in(c, delays) for c in self.cuts]
         rows = [self._row(w) for w in range(len(self.cuts))]
-        fields = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        for name in ("vehicle", "payload", "gyro"):
-            counts = fields[f"{name}_count"]
-            fields[f"{name}_first"] = np.cumsum(counts) - counts
-        self.windows = {
-            name: fields[name].astype(int if kind[0] == "int" else float)
-            for name, kind in WINDOW_FIELDS.items()
+        self.windows = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        vehicle, attitude, payload, gyro = zip(*self.samples)
+        recorded = {
+            "command_time": np.concatenate([f.command_time for f in self.flights]),
+            "command": np.concatenate([f.command for f in self.flights]),
+            "vehicle_quat": np.concatenate([part.values for part in attitude]),
         }
-        self.recording = Recording(self.windows, self._pack_recordings())
+        for name, parts in (("vehicle", vehicle), ("payload", payload), ("gyro", gyro)):
+            counts = np.array([len(part.time) for part in parts])
+            self.windows[f"{name}_count"] = counts
+            self.windows[f"{name}_first"] = np.cumsum(counts) - counts
+            recorded[f"{name}_time"] = np.concatenate([part.time for part in parts])
+        self.recording = Recording(self.windows, recorded)
         self.rows = self.recording.rows
         self._groups = [_groups_of(*samples) for samples in self.samples]
         self.sigma = []
@@ -170,18 +174,6 @@ class ReplayedFlights:
             measured[has_value] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
-    def _pack_recordings(self) -> dict[str, ndarray]:
-        """Return commands and stamps of all windows, as the kernel reads them."""
-        vehicle, attitude, payload, gyro = zip(*self.samples)
-        return {
-            "command_time": np.concatenate([f.command_time for f in self.flights]),
-            "command": np.concatenate([f.command for f in self.flights]),
-            "vehicle_time": np.concatenate([part.time for part in vehicle]),
-            "vehicle_quat": np.concatenate([part.values for part in attitude]),
-            "payload_time": np.concatenate([part.time for part in payload]),
-            "gyro_time": np.concatenate([part.time for part in gyro]),
-        }
-
     def _samples_in(self, c: Cut, delays: Sequence[float]) -> list[ChannelSamples]:
         """Return the window's samples of vehicle, attitude, payload and gyro."""
         f = self.flights[c.flight]
@@ -196,7 +188,6 @@ class ReplayedFlights:
         """Return a window's fields, without the ranges of its stamps."""
         c = self.cuts[w]
         f = self.flights[c.flight]
-        vehicle, _, payload, gyro = self.samples[w]
         reach = c.start - LATEST, c.end + LATEST
         bounds = np.searchsorted(f.command_time, reach) + [-1, 1]
         first, last = bounds.clip(0, len(f.command_time)) + self.first_command[c.flight]
@@ -210,9 +201,6 @@ class ReplayedFlights:
             "clock_zero": f.start,
             "command_first": first,
             "command_last": last,
-            "vehicle_count": len(vehicle.time),
-            "payload_count": len(payload.time),
-            "gyro_count": len(gyro.time),
         }
 
     def separation(self, w: int) -> float:

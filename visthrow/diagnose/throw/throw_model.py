@@ -32,7 +32,7 @@ from visthrow.diagnose.throw.initial_states import (
     directions,
     moved_along,
 )
-from visthrow.diagnose.throw.landing import PredictedLandings, landings
+from visthrow.diagnose.throw.landing import landings
 from visthrow.diagnose.throw.linearising import Linearisation
 from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, carriers, record_of
 from visthrow.diagnose.throw.replay import (
@@ -114,7 +114,7 @@ class ThrowModel(Model):
         if silent and plant.vehicle.battery.kind == "sag":
             note = OTHER_CHARGE if "battery_charge" in self.entries else ""
             self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + note)
-        fitter = self._initial_fit(self.setting, self.flights)
+        fitter = InitialFit(self.flights, self.simulation(self.setting))
         begun = fitter.fit(states, {})
         # states at theta = 0, and the samples' derivatives by them
         self._nominal = begun, fitter.slopes
@@ -137,20 +137,16 @@ class ThrowModel(Model):
             self.notes = (f"{count} are looked at: all throws, and where commands vary most",)
         return chosen
 
-    def cut_into(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
-        """Return these windows of flights, in the time of their sensors."""
-        return ReplayedFlights(flights, cuts, self.setting)
-
     def _settle_without_slack(
         self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
     ) -> States:
         """Take the windows without the time in which ropes were slack; returns initial states."""
-        self.flights = self.cut_into(flights, cuts)
+        self.flights = ReplayedFlights(flights, cuts, self.setting)
         simulation = self.simulation(self.setting)
         states, ends = carried(self.flights, simulation)
         without_slack = self._cut_slack(ends)
         if without_slack != cuts:
-            self.flights = self.cut_into(flights, without_slack)
+            self.flights = ReplayedFlights(flights, without_slack, self.setting)
             states, _ = carried(self.flights, simulation)
         return states
 
@@ -299,10 +295,9 @@ class ThrowModel(Model):
         sizes = np.zeros(present.shape)
         for w, window in zip(numbers, linearised.windows.values()):
             sizes[w, present[w]] = following(self.flights, w, window, follows[present[w]], change)
-        begun = self._settled_at[_key(linearised.theta)]
-        moved = sizes + begun[MOVED]
-        moves = [moved[w, present[w]] for w in numbers]
-        return moved_along(begun, ways, sizes), dict(zip(linearised.windows, moves))
+        states = moved_along(self._settled_at[_key(before)], ways, sizes)
+        moves = [states[MOVED][w, present[w]] for w in numbers]
+        return states, dict(zip(linearised.windows, moves))
 
     def step_error(self) -> dict[str, float]:
         """See the base class."""
@@ -314,34 +309,26 @@ class ThrowModel(Model):
             np.fmax.at(worst, self._channel(w), change)
         return dict(zip(self.channels, worst.tolist()))
 
-    def landings(
-        self, theta: Mapping[str, float], flights: Sequence[int] | None = None
-    ) -> PredictedLandings | None:
-        """See :func:`visthrow.diagnose.throw.landing.landings`."""
-        return landings(self, theta, flights)
+    landings = landings
 
     def begun(self, theta: Mapping[str, float], cuts: Sequence[Cut]) -> tuple[Setting, States]:
         """The setting with effects at ``theta``, and states fitted in it at the starts of windows
         of the model's flights.
         """
         setting = self.at(theta)
-        flights = self.cut_into(self.flights.flights, cuts)
-        return setting, self._initial_fit(setting, flights).settled({})
+        flights = ReplayedFlights(self.flights.flights, cuts, self.setting)
+        return setting, InitialFit(flights, self.simulation(setting)).settled({})
 
     def simulation(self, *settings: Setting) -> Simulation:
         """Settings ready to be flown in, with this model's steps."""
         return Simulation(settings, self.substep, self.device)
-
-    def _initial_fit(self, setting: Setting, flights: ReplayedFlights) -> InitialFit:
-        """Return the fit of initial states in a setting."""
-        return InitialFit(flights, self.simulation(setting))
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
         states, slopes = self._nominal
         if setting == self.setting:
             return states
-        fitter = self._initial_fit(setting, self.flights)
+        fitter = InitialFit(self.flights, self.simulation(setting))
         places = [way.place for way in directions(self.setting.plant)]
         alike = [way.place for way in fitter.directions] == places
         return fitter.settled(slopes if alike else {})
