@@ -156,7 +156,7 @@ class TrimModel(NumericModel):
         scale = np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None]
         return command_of(p.thrust_map, thrust / scale)
 
-    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[dict[str, np.ndarray]]:
+    def knots(self, lanes: Lanes) -> list[dict[str, np.ndarray]]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
         return [self._means(stretch) for stretch in self.stretches]
 

@@ -36,6 +36,7 @@ JOINT = (  # block of the torque between vehicle and rope, which acts in all lat
 BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
 SYMBOLS = dict(zip(BLOCKS, ("F", "M", "F_p", "M_j")))
 BASE_UNITS = ("kg", "m", "s")
+OF_PAYLOAD = ("payload_pos_w", "payload_vel_w", "tension")  # quantities at the knots of a replay
 
 
 class KnotValues(dict):
@@ -122,13 +123,20 @@ class Term:
         return f"{SYMBOLS[self.block]} = c {' '.join(factor.symbol for factor in self.parts)}"
 
 
-def add_cable(values: dict[str, ndarray], mount: Sequence[float]) -> None:
-    """Add to quantities at knots where a cable is attached [m, body frame, from the centre of mass]
-    and where it leads.
-    """
-    values["mount_b"] = np.tile(mount, (len(values["time"]), 1))
+def describe_knots(
+    flown: Knots, time: ndarray, mount: Sequence[float] | None
+) -> dict[str, ndarray]:
+    """Return quantities at knots that a replay flew, with their times [s] and where a cable leads.
+
+    ``mount``: where the cable is attached [m, body frame, from the centre of mass]; None without a
+    payload, whose quantities are then left out."""
+    values = {**flown, "time": time}
+    if mount is None:
+        return {name: value for name, value in values.items() if name not in OF_PAYLOAD}
+    values["mount_b"] = np.tile(mount, (len(time), 1))
     reach = KnotValues(values)["reach_w"]
     values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
+    return values
 
 
 def term_of(law: LawParams) -> Term:
@@ -250,18 +258,14 @@ def terms_of(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
 
 def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
     """Return what all terms of :func:`terms_of` exert at the knots with a coefficient of 1, shape
-    (k, 3, T); the scalars of each are multiplied once.
+    (k, 3, T); products of scalars and vectors are computed once each.
     """
     vectors = VECTORS[terms[0].block]
     names = dict.fromkeys(term.vector for term in terms)
     factors = dict.fromkeys(term.factors for term in terms)
     directions = np.stack([vectors[name].read(values) for name in names], axis=-1)
-    products = {(): np.ones(len(directions))}
-    for scalars in factors:
-        if scalars:
-            *others, name = scalars
-            products[scalars] = products[tuple(others)] * SCALARS[name].read(values)
-    every = np.stack([*products.values()], axis=-1)[:, None, :, None] * directions[:, :, None]
+    products = np.stack([_product(scalars, values) for scalars in factors], axis=-1)
+    every = products[:, None, :, None] * directions[:, :, None]
     return every.reshape(len(directions), 3, len(terms))
 
 

@@ -189,8 +189,7 @@ class NumericModel(Model, ABC):
             if beyond := beyond_bounds(effect, size):
                 raise LogError(f"{beyond} in this model")
         if laws:
-            lanes = self._lanes(base)
-            known = self.knots(lanes, self.simulate(lanes))[0]
+            known = self.knots(self._lanes(base))[0]
             for law in laws:
                 self._expect_law(term_of(law), known)
         self._base = base
@@ -242,13 +241,12 @@ class NumericModel(Model, ABC):
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """Return the sensors' measurements in lanes of one stretch, shape (L, N)."""
 
-    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
-        """Return quantities of laws at the knots of each stretch's latent forces.
-
-        ``lanes``: one a stretch; ``paths``: the states on their grids, shape (S, T, states).
+    def knots(self, lanes: Lanes) -> list[Mapping[str, ndarray]]:
+        """Return quantities of laws at the knots of each stretch's latent forces; ``lanes``: one a
+        stretch.
         """
         knots = []
-        for stretch, path in zip(self.stretches, paths):
+        for stretch, path in zip(self.stretches, self.simulate(lanes)):
             time = np.unique(stretch.latent_time)
             weights = triangles(time, np.linspace(time[0], time[-1], len(path)))
             knots.append(self.quantities(time, weights @ path))
@@ -305,8 +303,7 @@ class NumericModel(Model, ABC):
         effects = self._slopes_by(size, "theta", steps, numbers)
         steps = np.full(len(self.stretches[0].latent_block), self.latent_step)
         latent = self._slopes_by(size, "latent", steps, range(len(steps)))
-        lanes = self._lanes(size)
-        knots = self.knots(lanes, self.simulate(lanes))
+        knots = self.knots(self._lanes(size))
         windows: list[Window] = []
         for i, stretch in enumerate(self.stretches):
             window = replace(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy import ndarray
 
 from visthrow.common.rotations import multiply, normal_part, quat_of_vector, rotate, vectors_between
-from visthrow.diagnose.models.law_terms import add_cable
+from visthrow.diagnose.models.law_terms import describe_knots
 from visthrow.diagnose.models.numeric import Lanes, Stretch, triangles
 from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams
@@ -29,7 +29,7 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
     without_each,
 )
 from visthrow.logs.flightlog import FlightLog
-from visthrow.logs.samples import Samples
+from visthrow.logs.samples import Samples, on_grid
 
 ROWS = 2  # of commands and attitudes a step
 SWINGING = 3  # steps a row where a payload swings below
@@ -111,25 +111,20 @@ class FlyerModel(DrivenModel):
         samples = np.concatenate([path[:, :poses:2], path[:, poses:others_end]], axis=1)
         return samples.reshape(len(path), -1)
 
-    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
+    def knots(self, lanes: Lanes) -> list[Mapping[str, ndarray]]:
         """See the base class."""
         flown = self._fly(lanes, keep=True).knots
         cable = self.params.cable
+        mount = None if cable is None else cable.mount
         level = self._level(lanes)
         listed = []
         for i, stretch in enumerate(self.stretches):
             rows = slice(i * self.knot_count, (i + 1) * self.knot_count)
             values = {name: value[rows] for name, value in flown.items()}
-            values["time"] = np.unique(stretch.latent_time)
             if NEIGHBOUR in self.inputs:
                 at_knots = np.linspace(0, self.rows, self.knot_count).round().astype(int)
                 values[NEIGHBOUR] = rotate(level[i], stretch.data[NEIGHBOUR][at_knots])
-            if cable is None:
-                for name in ("payload_pos_w", "payload_vel_w", "tension"):
-                    del values[name]
-            else:
-                add_cable(values, cable.mount)
-            listed.append(values)
+            listed.append(describe_knots(values, np.unique(stretch.latent_time), mount))
         return listed
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
@@ -157,16 +152,11 @@ class FlyerModel(DrivenModel):
         """Replay lanes (``sim.kernels.replay.lanes.Replayed``).
 
         ``keep``: whether the quantities at the knots of each are wanted."""
-        from sim.kernels.replay.lanes import Recording
-
         driven = np.column_stack([lanes.owner, lanes.theta])
         _, first, window = np.unique(driven, axis=0, return_index=True, return_inverse=True)
         flights = lanes.part(first)  # one for all that begin or are pushed otherwise
         tables = self._commands(flights) | self._attitudes(flights)
         begun = {name: table[window, 0] for name, table in tables.items()}
-        recorded = self._stamps()
-        for name, table in tables.items():
-            recorded[name] = table.reshape(-1, *table.shape[2:])
         sizes, plant = np.unique(lanes.theta, axis=0, return_inverse=True)
         replay = replay_of(self.params, self.laws, dict(zip(self.numbers, sizes.T)))
         count = len(lanes.owner)
@@ -189,7 +179,7 @@ class FlyerModel(DrivenModel):
         }
         return replay.run(
             self._begin(lanes, begun),
-            Recording(self._windows(flights), recorded),
+            self._recording(flights, tables),
             flown,
             self.params.window / (self.knot_count - 1),
             self.knot_count * count,
@@ -217,14 +207,10 @@ class FlyerModel(DrivenModel):
         """
         late = self.spare + self.size_of(lanes, "attitude_delay") / self.row
         measured = self.of_windows(lanes, "turned")
-        position = late[:, None] + np.arange(self.rows + 1)
-        index = position.astype(int).clip(0, measured.shape[1] - 2)
-        lane = np.arange(len(late))[:, None]
-        before = measured[lane, index]
-        share = (position - index)[..., None]
-        quat, rate, lean = np.split(
-            before + share * (measured[lane, index + 1] - before), [4, 7], axis=2
-        )
+        rows = np.arange(measured.shape[1])
+        imposed = rows[: self.rows + 1]
+        shown = [on_grid(rows, table, begin + imposed) for table, begin in zip(measured, late)]
+        quat, rate, lean = np.split(np.array(shown), [4, 7], axis=2)
         quat /= np.linalg.norm(quat, axis=2, keepdims=True)
         turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")[:, None]
         turn = turn + self.size_of(lanes, "estimator_lean")[:, None, None] * lean
@@ -249,9 +235,14 @@ class FlyerModel(DrivenModel):
         """Return the attitude of the measured frame in the world, shape (B, 4)."""
         return quat_of_vector(self.stack(lanes, "frame_tilt_x", "frame_tilt_y", ""))
 
-    def _windows(self, flights: Lanes) -> dict[str, ndarray]:
-        """Return the windows that a replay flies."""
+    def _recording(self, flights: Lanes, tables: Mapping[str, ndarray]) -> Any:
+        """Return the windows that a replay flies, and the stamps of what each sensor shows of them
+        (``sim.kernels.replay.lanes.Recording``).
+
+        ``tables``: what drives each flight, shape (B, rows, ...).
+        """
         from sim.kernels.replay.kernel import ATTACHED, NO_PAYLOAD
+        from sim.kernels.replay.lanes import Recording
 
         count = len(flights.owner)
         start = self.of_windows(flights, "start")
@@ -267,27 +258,19 @@ class FlyerModel(DrivenModel):
             "command_first": first,
             "command_last": first + self.rows,
         }
-        for sensor, stamps in self._shown_stamps().items():
-            counts = np.array([len(time) for time in stamps])
-            fields[f"{sensor}_count"] = counts[flights.owner]
-            fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[flights.owner]
-        return {name: np.broadcast_to(value, count) for name, value in fields.items()}
-
-    def _shown_stamps(self) -> dict[str, list[ndarray]]:
-        """Return the stamps of what each sensor shows of each stretch [s]."""
+        data = {name: table.reshape(-1, *table.shape[2:]) for name, table in tables.items()}
         channels = {"vehicle": self.params.position, "payload": "payload_pos_w", "gyro": "rate_b"}
-        stamps = {}
         for sensor, name in channels.items():
             number = self.channels.index(name) if name in self.channels else -1
-            stamps[sensor] = [s.time[s.channel == number][::3] for s in self.stretches]
-        return stamps
-
-    def _stamps(self) -> dict[str, ndarray]:
-        """Return the stamps of all stretches as a replay reads them."""
-        shown = self._shown_stamps()
-        stamps = {f"{name}_time": np.concatenate(times) for name, times in shown.items()}
+            shown = [s.time[s.channel == number][::3] for s in self.stretches]
+            counts = np.array(list(map(len, shown)))
+            fields[f"{sensor}_count"] = counts[flights.owner]
+            fields[f"{sensor}_first"] = (np.cumsum(counts) - counts)[flights.owner]
+            data[f"{sensor}_time"] = np.concatenate(shown)
         unused = np.array([0.0, 0.0, 0.0, 1.0])  # attitudes are imposed, not compared
-        return stamps | {"vehicle_quat": np.tile(unused, (len(stamps["vehicle_time"]), 1))}
+        data["vehicle_quat"] = np.tile(unused, (len(data["vehicle_time"]), 1))
+        windows = {name: np.broadcast_to(value, count) for name, value in fields.items()}
+        return Recording(windows, data)
 
     def _begin(self, lanes: Lanes, begun: Mapping[str, ndarray]) -> dict[str, ndarray]:
         """Return initial states of a replay from the unknowns at the windows' start.

@@ -30,7 +30,7 @@ def _neutral_plant() -> PlantParams:
     return plant_of(load_experiment("state"))
 
 
-def plant_for(params: FlyerParams, laws: tuple[LawParams, ...] = ()) -> PlantParams:
+def plant_for(params: FlyerParams, laws: tuple[LawParams, ...]) -> PlantParams:
     """Return the plant of a setup as it stands, whose commands are the motors' thrusts at once."""
     base = _neutral_plant()
     torque = params.torque or TorqueParams(

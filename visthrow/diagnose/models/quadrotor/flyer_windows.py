@@ -50,7 +50,7 @@ def cut_flying(
     """Yield start [s], samples of ``channels``, and what the motors need, of each window in which
     the vehicle flies and no channel of ``driving`` has a large gap.
     """
-    sigma = [sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels]
+    sigma = {name: sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels}
     driven = [log[name] for name in driving]
     commands = log[params.input].samples()
     if params.input == "command":
@@ -66,8 +66,7 @@ def cut_flying(
         end = start + params.window
         if not flies(cut_commands(commands, start, end).values, params):
             continue
-        rows = [take_samples(log[name], params, start) for name in channels]
-        tables = [(*row, sd) for row, sd in zip(rows, sigma)]
+        tables = [(*take_samples(log[name], params, start), sd) for name, sd in sigma.items()]
         sent = cut_commands(commands, start - params.window, end + params.window)
         common: dict[str, Any] = {"start": start, "sent": sent, "volts": 0.0}
         common["since"] = start - log[params.input].time[0]
