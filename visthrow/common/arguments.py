@@ -51,6 +51,7 @@ TYPES: Mapping[str, Callable[[str], Any]] = {
     "port": checked_number(int, lambda x: 0 < x < 65536, "a port, 1 to 65535"),
     "int": int,
     "float": float,
+    "names": lambda text: text.split(","),
     "solver": "sim.solver={}".format,
 }
 """Readers of words of the command line by their names in tables of arguments."""

@@ -140,7 +140,7 @@ def without_transient(
 
 
 def with_firmware(
-    path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None = None
+    path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None
 ) -> str:
     """A configuration that flies the firmware's controller.
 
@@ -177,7 +177,7 @@ def of_setup(
     setup: Setup,
     saved: SavedDiagnosis,
     provenance: Sequence[str],
-    rank: int = 0,
+    rank: int,
 ) -> str:
     """The TOML file of a setup of another model than the throw, extended by the sizes and laws that
     a diagnosis of it found.

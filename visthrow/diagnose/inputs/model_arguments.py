@@ -57,7 +57,7 @@ class Opened:
         else:
             model = setup.model_of(chosen, logs)
             if args.only is not None:
-                model.choose(args.only.split(","))
+                model.choose(args.only)
         if args.measured:
             model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
         # day of each flight, from 0: what its log says, else those of one folder are of one
@@ -122,16 +122,16 @@ def throw_model(
     from visthrow.task import load_experiment, plant_of
 
     experiment = load_experiment(args.plant, args.overrides)
-    only = args.only.split(",") if args.only is not None else None
-    measured = {
+    plant = plant_of(experiment)
+    options = {
         "sensing": experiment.sensing,
         "camera": experiment.camera,
         "device": resolve_for_warp(args.device),
+        "only": args.only,
+        "simpler": args.only is not None,
     }
-    measured |= {"only": only, "simpler": only is not None}
-    plant = plant_of(experiment)
     return correct_interface_mistakes(
-        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **measured)
+        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **options)
     )
 
 

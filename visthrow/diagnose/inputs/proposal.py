@@ -79,7 +79,7 @@ def propose(
     corrected = proposal.mapping
     _judge_thrust(log, proposal, mass)
     if proposal.mapping is not corrected:
-        log = _log(table, source, proposal.mapping)
+        log = _without_sparse(logs_of(table, proposal.mapping, source)[0])
     proposal.flyer = _flyer(log, proposal, mass)
     if mass is not None and proposal.flyer is None:
         proposal.questions.append(
@@ -96,13 +96,13 @@ def propose_model(log: FlightLog, mass: float | None = None) -> MappingProposal:
     Raises LogError: the log holds too little for one.
     """
     proposal = MappingProposal()
-    full = {name: c for name, c in log.channels.items() if np.sum(c.valid) >= 50}
-    proposal.flyer = _flyer(FlightLog(full, log.meta), proposal, mass)
+    full = _without_sparse(log)
+    proposal.flyer = _flyer(full, proposal, mass)
     if proposal.flyer is None:
         raise LogError(
             f"{log.meta.get('source')}: no flying model proposed: that needs pos_w, quat_wb and one"
             f" of {', '.join(thrust_checks.INPUTS)}; of those that hold 50 samples it has"
-            f" {', '.join(full)}"
+            f" {', '.join(full.channels)}"
         )
     return proposal
 
@@ -198,7 +198,7 @@ def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
     set explains; the rest is asked about. Returns the log of channels that hold enough.
     """
     for attempt in range(2):
-        log = _log(table, source, proposal.mapping)
+        log = _without_sparse(logs_of(table, proposal.mapping, source)[0])
         wrong = [row for row in physics.look(log) if row.verdict == "bad"]
         turns = [
             row
@@ -214,9 +214,8 @@ def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
     return log
 
 
-def _log(table: Table, source: str, mapping: TableMap) -> FlightLog:
-    """Read a table's first log, without the channels that hold too little."""
-    log = logs_of(table, mapping, source)[0]
+def _without_sparse(log: FlightLog) -> FlightLog:
+    """Return a log without the channels that hold too little."""
     full = {name: c for name, c in log.channels.items() if np.sum(c.valid) >= 50}
     return FlightLog(full, log.meta)
 

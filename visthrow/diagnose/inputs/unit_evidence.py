@@ -195,7 +195,7 @@ def by_fall(time: ndarray, path: ndarray) -> str:
     return best if shares[best] > _SHARE else ""
 
 
-def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> str:
+def by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
     """Find the unit of a thrust in which it carries what was weighed.
 
     Args:

@@ -4,13 +4,14 @@ them in one batch.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy import ndarray
 
 from sim.effects.effect import apply
+from sim.effects.setting import AERODYNAMICS
 from sim.params import PlantParams, changed
 from sim.scaling.units import Units, convert_units
 from visthrow.common import mocap
@@ -161,7 +162,7 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     alike = Units(ratio ** (1 / 3), ratio)
     vehicle = convert_units(plant.vehicle, alike)
     rope = convert_units(plant.rope, alike)
-    values = {f"aero.{f.name}": 0.0 for f in fields(vehicle.aero) if f.name != "kind"}
+    values = {f"aero.{name}": 0.0 for name in AERODYNAMICS}
     values |= {
         "aero.drag_x": params.drag_xy,
         "aero.drag_y": params.drag_xy,

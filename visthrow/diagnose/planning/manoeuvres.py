@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
+from numpy.polynomial import Polynomial
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.common.toml_text import tables_beside
@@ -100,10 +101,13 @@ def _share(t: ndarray, begin: float, length: float) -> ndarray:
     return np.clip((t - begin) / length, 0.0, 1.0)
 
 
+RISE = Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
+"""From 0 at 0 to 1 at 1, with speed and acceleration 0 at both ends."""
+
+
 def rise(t: ndarray, begin: float, length: float) -> ndarray:
-    """Return a rise from 0 to 1 with speed and acceleration 0 at both ends."""
-    s = _share(t, begin, length)
-    return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
+    """Return a rise from 0 to 1 over a stretch."""
+    return RISE(_share(t, begin, length))
 
 
 def _doublets(t: ndarray) -> ndarray:
@@ -131,9 +135,8 @@ def _steps(t: ndarray) -> ndarray:
 
 def _integrate_rise(t: ndarray, begin: float, length: float) -> ndarray:
     """Integral of :func:`rise` over time."""
-    s = _share(t, begin, length)
     after = np.maximum(t - begin - length, 0.0)
-    return length * s**4 * (2.5 + s * (-3.0 + s)) + after
+    return length * RISE.integ()(_share(t, begin, length)) + after
 
 
 def _stop(t: ndarray) -> ndarray:

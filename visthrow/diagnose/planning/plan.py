@@ -124,18 +124,18 @@ class PlanningGoal:
         most: list[tuple[int, ...]] = []
         repeats = 0
         for count in range(1, MOST_REPEATS + 1):
-            settled = self._apart(new, count) if self.pairs else self._named(new, count)
+            settled = self._settled_by(new, count)
             if len(settled) > len(most):
                 most = settled
                 repeats = count
         return most, repeats
 
-    def _apart(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
-        """Return the pairs that so many flights separate."""
-        return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
-
-    def _named(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
-        """Return the effects that so many flights measure well enough to name."""
+    def _settled_by(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
+        """Return the pairs that so many flights separate, or the effects that they measure well
+        enough to name.
+        """
+        if self.pairs:
+            return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
         able = self.priors.slab[self.vague] * NAMEABLE
         unknown = self._deviations(0.0 * new) > able
         known = self._deviations(count * new) < able

@@ -95,17 +95,15 @@ class Trained:
         of_weights = slice(-len(self.reach), None)
         information = chosen.information.sum(0)[of_weights, of_weights]
         score = chosen.score.sum(0)[of_weights]
-        mean = np.zeros(len(self.reach))
-        likeliest = -np.inf
+        nats = []
+        means = []
         for reach in REACHES:
             prior = reach * self.reach
-            lower = np.linalg.cholesky(information * np.outer(prior, prior) + np.eye(len(prior)))
-            half = np.linalg.solve(lower, score * prior)
-            nats = 0.5 * half @ half - np.log(np.diag(lower)).sum()
-            if nats > likeliest:
-                likeliest = nats
-                mean = prior * np.linalg.solve(lower.T, half)
-        return mean
+            normal = information * np.outer(prior, prior) + np.eye(len(prior))
+            mean = np.linalg.solve(normal, score * prior)
+            nats.append(0.5 * (score * prior @ mean - np.linalg.slogdet(normal)[1]))
+            means.append(prior * mean)
+        return means[np.argmax(nats)]
 
 
 def train(

@@ -47,8 +47,8 @@ class LandingGain:
         str, float
     ]  # named effect -> mean distance by which it moves the predicted landings
     # of each throw, prediction less measurement along world x and y
-    off_before: tuple[tuple[float, float], ...]
-    off_after: tuple[tuple[float, float], ...]
+    off_before: list[list[float]]
+    off_after: list[list[float]]
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,6 @@ def landing_gain(
         without = model.landings(remaining, flown) if remaining else plain
         level = (named.predicted - without.predicted)[good, :2]
         moved[name] = np.nanmean(np.linalg.norm(level, axis=1))
-    off = []
-    for prediction in (plain, held_landings):
-        level = (prediction.predicted - prediction.measured)[good, :2]
-        off.append(tuple(map(tuple, level.tolist())))
     after = mean(held_landings.errors[good], seed=seed)
     return LandingGain(
         throws=int(good.sum()),
@@ -129,8 +125,8 @@ def landing_gain(
         released_before=np.nanmean(plain.released_errors[good]),
         released_after=np.nanmean(held_landings.released_errors[good]),
         moved=moved,
-        off_before=off[0],
-        off_after=off[1],
+        off_before=plain.off[good].tolist(),
+        off_after=held_landings.off[good].tolist(),
     )
 
 

@@ -27,13 +27,13 @@ def run(args: argparse.Namespace) -> int:
 
     check_place(Path(args.out) / "plan.json")
     limits = _limits(args)
-    chosen = named(args.manoeuvres.split(",")) if args.manoeuvres else catalogue()
+    chosen = named(args.manoeuvres) if args.manoeuvres else catalogue()
     opened = opening.Opened(args)
     diagnosis = opened.diagnose(laws=False)
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
-    aim = plan.PlanningGoal(diagnosis, tuple(name for name in args.about.split(",") if name))
+    aim = plan.PlanningGoal(diagnosis, args.about)
     simulate, flown = simulator_of(
         opened.model,
         diagnosis,
