@@ -51,6 +51,7 @@ def test_one_effect_is_named_with_its_size_and_interval(sign):
     assert diagnosis.named == ("effect_03",)
     assert "cause 3" in finding.sentence
     assert finding.nats > diagnosis.threshold
+    assert "np." not in repr(diagnosis)
 
 
 TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}

@@ -36,9 +36,9 @@ something is named.
 
 Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995, section 3.2)."""
 
-NORMAL_95 = ndtri(1.0 - 0.5 * POSSIBLE)  # deviations to either end of an interval
-STRONG = -np.log(POSSIBLE)
-VERY_STRONG = -np.log(ALARM)
+NORMAL_95 = float(ndtri(1.0 - 0.5 * POSSIBLE))  # deviations to either end of an interval
+STRONG = -float(np.log(POSSIBLE))
+VERY_STRONG = -float(np.log(ALARM))
 """Nats: what is less than strongly behind counts as possible; any cause must be very strong,
 however few are in question. Where nothing is wrong, a Bayes factor exceeds 1 / ALARM in no more
 than ALARM of worlds (Markov's inequality).
@@ -201,7 +201,7 @@ class Posterior:
             inverse = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0]
             spread = slab * np.sqrt(inverse[columns].diagonal())
             value += self._log_within(columns, slab * mean[columns], spread).sum()
-        return value
+        return float(value)
 
     def _log_within(self, sets: Sequence[int] | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
         """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
@@ -282,7 +282,7 @@ class Posterior:
         means, variances, weights = np.array(estimates).T
         mean = np.average(means, weights=weights)
         variance = np.average(variances + (means - mean) ** 2, weights=weights)
-        return mean, np.sqrt(variance)
+        return float(mean), float(np.sqrt(variance))
 
     def mean_sizes(self, active: Sequence[int], sets: Sets) -> ndarray:
         """Return the means of some effects as :meth:`averaged`, within their bounds, and 0 for all
@@ -340,4 +340,4 @@ def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator) 
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")
     null = Posterior(information, null_draws(information, CALIBRATION_DRAWS, rng), priors)
     best = null.additions(()).max(axis=1)
-    return max(np.quantile(best, 1.0 - ALARM), VERY_STRONG)
+    return float(max(np.quantile(best, 1.0 - ALARM), VERY_STRONG))

@@ -104,7 +104,7 @@ class Noise:
         """
         square = self.share**2
         nats = np.log(square) + 1.0 / square - 1.0
-        return -0.5 * TAIL * nats.sum()
+        return float(-0.5 * TAIL * nats.sum())
 
 
 @dataclass(frozen=True)

@@ -323,7 +323,7 @@ def allowed(size: float) -> float:
     """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
     floors.
     """
-    return np.hypot(1.0, INEXACT * size)
+    return float(np.hypot(1.0, INEXACT * size))
 
 
 def between_flights(

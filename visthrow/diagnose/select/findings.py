@@ -67,11 +67,11 @@ class Reading:
         homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
         mean, sd = point.posterior.averaged(j, homes)
-        deviation = np.hypot(sd, MODEL_ERROR_FLOOR) * effect.floor
+        deviation = float(np.hypot(sd, MODEL_ERROR_FLOOR)) * effect.floor
         nats = point.evidence([*remaining, j]) - point.evidence(remaining)
         finding = replace(blank(effect), sd=deviation, nats=nats)
         if j in self.active or partners:
-            differs = np.sqrt(self.unlike) * allowed(mean) * effect.floor
+            differs = float(np.sqrt(self.unlike)) * allowed(mean) * effect.floor
             named = replace(finding, differs=differs)
             return self._named(named, mean, sorted({j, *partners}))
         size = mean * effect.floor
@@ -150,7 +150,7 @@ class Reading:
         ``members`` are those of its class.
         """
         bounds = finding.low, finding.high
-        size = np.clip(mean * finding.floor, *bounds) + 0.0  # no -0
+        size = float(np.clip(mean * finding.floor, *bounds)) + 0.0  # no -0
         reach = NORMAL_95 * finding.sd
         low = max(bounds[0], size - reach) + 0.0
         high = min(bounds[1], size + reach) + 0.0

@@ -174,17 +174,17 @@ def share_of(promised: ndarray, brought: ndarray) -> tuple[float, float, float]:
     A right size brings what it promises with a variance of twice that. The interval is that of the
     flights' scatter about the part (Student, over those that can tell), or of this chance where it
     is wider."""
-    total = promised.sum()
+    total = float(promised.sum())
     if total <= 0.0:
         return 0.0, np.nan, np.nan
-    value = brought.sum() / total
+    value = float(brought.sum()) / total
     n = count_telling(promised)
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
     scatter = np.sqrt(n / (n - 1.0) * square) / total
     chance = NORMAL_95 * np.sqrt(2.0 / total)
-    reach = max(stdtrit(n - 1, 0.975) * scatter, chance)
+    reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
     return value, value - reach, value + reach
 
 

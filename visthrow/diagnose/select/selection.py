@@ -445,7 +445,7 @@ class Selector:
         """Say what was selected, and keep what was compared for the report."""
         nats = {names_of(s): lead for s, lead in leads.items() if np.isfinite(lead)}
         ranked = sorted(listed.items(), key=lambda item: -item[1])[:REPORTED_SETS]
-        screened = {names_of(s): gain for s, gain in ranked}
+        screened = {names_of(s): float(gain) for s, gain in ranked}
         name = names_of(top.chosen)
         self.progress(f"{name}: {top.lead:.1f} nats ahead")
         self.steps.append(SelectionStep(name, top.lead, screened, nats))
