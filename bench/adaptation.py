@@ -28,7 +28,7 @@ from visthrow.diagnose.apply.patch import extended
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of, load_experiment
 from visthrow.training.protocol import throw
-from visthrow.training.trainer import ADAPTATION, Trainer, fitted
+from visthrow.training.trainer import ADAPTATION, Trainer, adopt_layers
 
 TARGET = 2.0
 THROWS = 1000
@@ -42,7 +42,7 @@ def adapted(
     """The policy after a full training, or one cut at ``--seconds``; its seconds without the
     set-up, and its iterations.
     """
-    trainer = Trainer(fitted(experiment, policy), args.device, args.seed)
+    trainer = Trainer(adopt_layers(experiment, policy), args.device, args.seed)
     spent = 0.0
     trainer.algorithm.take_up(policy)
     while trainer.iteration < trainer.algorithm.iterations and spent < args.seconds:

@@ -364,7 +364,7 @@ def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
         for name in ("command", "release_command", "battery_voltage", "pos_w", "quat_wb")
     }
     channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
-    measured = mocap.measured(
+    measured = mocap.add_mocap_noise(
         {name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng
     )
     channels |= {

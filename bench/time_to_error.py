@@ -58,7 +58,7 @@ def train(
         spent += time.perf_counter() - begin
         if not evaluations.due(trainer.iteration) and trainer.iteration < last:
             continue
-        with evaluations.timed():
+        with evaluations.measure_cost():
             throws = trainer.throw(TARGET, THROWS)
         summary = throws.summary()
         error = summary.get("error_mean", math.nan)
@@ -69,7 +69,7 @@ def train(
             flush=True,
         )
         for bar in reached:
-            in_a_row[bar] = in_a_row[bar] + 1 if throws.within(float(bar)) else 0
+            in_a_row[bar] = in_a_row[bar] + 1 if throws.land_within(float(bar)) else 0
             if in_a_row[bar] == IN_A_ROW and reached[bar] is None:
                 reached[bar] = curve[-1]
     final: dict[str, list] = {}

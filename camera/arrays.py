@@ -20,7 +20,7 @@ Array = Any
 """A tensor or an array; what a function returns is of the kind of its arguments."""
 
 
-def by_torch(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
+def wrap_for_arrays(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
     """Return a function of tensors as one of arrays."""
     return lambda *arrays: function(*map(torch.from_numpy, arrays)).numpy()
 
@@ -40,11 +40,11 @@ class ArrayFunctions:
     stack = np.stack
     where = np.where
     zeros_like = np.zeros_like
-    atan = by_torch(torch.atan)
-    cos = by_torch(torch.cos)
-    sin = by_torch(torch.sin)
+    atan = wrap_for_arrays(torch.atan)
+    cos = wrap_for_arrays(torch.cos)
+    sin = wrap_for_arrays(torch.sin)
     sqrt = np.sqrt
-    linalg = SimpleNamespace(cross=by_torch(torch.linalg.cross))
+    linalg = SimpleNamespace(cross=wrap_for_arrays(torch.linalg.cross))
 
 
 def library(array: Tensor | np.ndarray) -> Any:
@@ -69,7 +69,7 @@ def push(history: Array, new: Array, reset_mask: Array) -> Array:
     return xp.where(mask, front, xp.concatenate([front, history[:, :-1]], 1))
 
 
-def at_latency(history: Tensor, latency: Tensor) -> Tensor:
+def interpolate_at_latency(history: Tensor, latency: Tensor) -> Tensor:
     """Value that is ``latency`` steps old, linear between the two stored neighbours.
 
     Written as hat-function weights over the whole (short) history: no gather, latencies may differ

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camera.arrays import at_latency, latency_weights, push, redraw
+from camera.arrays import interpolate_at_latency, latency_weights, push, redraw
 from camera.keypoints import KEYPOINTS, KeypointCamera, correct_keypoints, keypoints
 from camera.params import CameraParams, KeypointNoiseParams
 
@@ -77,7 +77,7 @@ def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tu
     """
     used = latency_weights(history.shape[1], latency, history) > 0.0
     valid = (valid_history | ~used.unsqueeze(-1)).all(1)
-    return at_latency(history, latency), valid
+    return interpolate_at_latency(history, latency), valid
 
 
 class DetectorView:

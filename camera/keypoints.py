@@ -62,7 +62,7 @@ class KeypointCamera:
         self._axes = torch.eye(2, 3, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
-    def on_arrays(self) -> "KeypointCamera":
+    def convert_to_arrays(self) -> "KeypointCamera":
         """Return the camera with its constants as NumPy arrays, for functions of arrays."""
         camera = copy.copy(self)
         for name, value in vars(self).items():

@@ -14,9 +14,9 @@ from sim.effects.effect import apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
 from tests.plants import EVERYTHING, paper_plant
-from visthrow.config.effects import chosen
+from visthrow.config.effects import choose_effects
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.throws.plants import flown
+from visthrow.throws.plants import fly_payloads
 
 FINE = 5e-4  # integration step of the flights [s]
 TICK = 0.005  # between samples [s]
@@ -26,7 +26,7 @@ NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 
 def setting_with(theta: dict[str, float]) -> Setting:
     """The paper's plant with effects of the catalogue."""
-    return apply(chosen(theta), Setting(paper_plant()), theta)
+    return apply(choose_effects(theta), Setting(paper_plant()), theta)
 
 
 def fly(
@@ -89,7 +89,7 @@ def fly(
             left[e] = (sim.get("payload_pos_w")[e], sim.get("payload_vel_w")[e])
         for e in np.flatnonzero(np.isfinite(separated)):
             gone = np.array([t + TICK - separated[e]])
-            ball[e] = flown(plant.rope, plant.air, *(x[None] for x in left[e]), gone)[0][0]
+            ball[e] = fly_payloads(plant.rope, plant.air, *(x[None] for x in left[e]), gone)[0][0]
         tracks["payload_pos_w"].append(ball)
         for name in ("pos_w", "quat_wb"):
             tracks[name].append(sim.get(name))

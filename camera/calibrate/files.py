@@ -81,7 +81,7 @@ def read(
             raise ValueError(
                 f"holds no camera of a known tool; expected one of {', '.join(BOXES)}{hint}"
             )
-        box, node, name = _chosen(cameras, camera)
+        box, node, name = _choose_camera(cameras, camera)
         node = {**node, "asked_model": model} if model else node
         lens, report = _lens(*_camera(box, node), node, fov_deg)
     except ValueError as error:
@@ -101,7 +101,7 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     up). Raises ValueError: no 4 x 4 matrix with a rotation."""
     from scipy.spatial.transform import Rotation
 
-    _, node, _ = _chosen(_cameras_of(path), camera)
+    _, node, _ = _choose_camera(_cameras_of(path), camera)
     key = next((key for key in ("T_cam_imu", "T_imu_cam") if key in node), None)
     if key is None:
         return None
@@ -123,7 +123,7 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     )
 
 
-def _chosen(entries: list[Entry], camera: int | str) -> Entry:
+def _choose_camera(entries: list[Entry], camera: int | str) -> Entry:
     names = [name for *_, name in entries]
     number = int(camera) if str(camera).isdigit() else -1
     if camera in names:

@@ -408,7 +408,7 @@ def _find_last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarr
     index = _index_of_last(falls)
     hit &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
     place = np.minimum(window[rows[:, 0], index], peak - 1)
-    return hit, _between(values, reach, place, level)
+    return hit, _interpolate_crossing(values, reach, place, level)
 
 
 def _find_first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
@@ -419,7 +419,7 @@ def _find_first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndar
     level = 0.5 * plateau
     falls = _falls(values, level)
     hit = falls.any(axis=1) & (plateau > LEAST_LEVEL)
-    return hit, _between(values, reach, np.argmax(falls, axis=1), level)
+    return hit, _interpolate_crossing(values, reach, np.argmax(falls, axis=1), level)
 
 
 def _falls(values: ndarray, level: ndarray) -> ndarray:
@@ -433,7 +433,9 @@ def _index_of_last(marks: ndarray) -> ndarray:
     return marks.shape[1] - 1 - np.argmax(marks[:, ::-1], axis=1)
 
 
-def _between(values: ndarray, reach: ndarray, index: ndarray, level: ndarray) -> ndarray:
+def _interpolate_crossing(
+    values: ndarray, reach: ndarray, index: ndarray, level: ndarray
+) -> ndarray:
     """Place between two samples where a level is crossed."""
     rows = np.arange(len(values))
     high = values[rows, index]

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from visthrow.common.mocap import measured
+from visthrow.common.mocap import add_mocap_noise
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 SLACK = 1e-9  # tolerance of times that are sums of periods [s]
@@ -55,7 +55,7 @@ class Mocap:
             "quat_wb": math.radians(p.angle_noise_deg),
         }
         exact = {name: truth[name][None].astype(float) for name in noise}
-        vehicle, payload, quat = measured(exact, noise, rng).values()
+        vehicle, payload, quat = add_mocap_noise(exact, noise, rng).values()
         lost = rng.random(2) < p.loss
         bodies = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
         poses = [

@@ -15,7 +15,7 @@ from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor
-from visthrow.throws.plants import flown
+from visthrow.throws.plants import fly_payloads
 
 STEPS = 12  # of 20 ms
 REFERENCE_STEP = 2e-3  # s, at most; of order 4: payloads move by 2 nm against steps of a quarter
@@ -192,7 +192,7 @@ def test_a_payload_flies_and_lands_as_its_equation_says(drag, side, lift, wind, 
     assert sim.get("time_to_impact")[0] == approx(path.t[-1], abs=1e-7)
     assert_allclose(sim.get("landing_w")[0], path.y[:3, -1], atol=1e-6)
     away = np.array([0.1, 0.3])
-    gone = flown(plant.rope, plant.air, *(np.tile(x, (2, 1)) for x in (pos, vel)), away)
+    gone = fly_payloads(plant.rope, plant.air, *(np.tile(x, (2, 1)) for x in (pos, vel)), away)
     assert_allclose(np.hstack(gone), path.sol(away).T, atol=1e-6)
     at = path.sol(np.linspace(0, path.t[-1], plant.release.clearance_samples))[:3]
     nearest = norm(at.T - sim.get("release_pos_w")[0], axis=1).min()

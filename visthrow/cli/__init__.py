@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
-        if hider := _hidden(error):
+        if hider := _find_hiding_file(error):
             return _refuse(
                 f"{hider} hides visthrow's own package of that name; rename it, or run the command"
                 " from another folder"
@@ -106,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(str(error) or type(error).__name__)
 
 
-def _hidden(error: ModuleNotFoundError) -> str | None:
+def _find_hiding_file(error: ModuleNotFoundError) -> str | None:
     """File of a foreign module or package that stands where one of ours is looked for, as a
     ``camera.py`` in the working folder.
     """

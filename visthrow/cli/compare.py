@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
         " trained otherwise"
         for name, departed in departures.items()
     ]
-    comparison = on_plant(plant, args.seed, entries, "".join(notes))
+    comparison = label_throws(plant, args.seed, entries, "".join(notes))
     figures = {"plant": plant, "seed": args.seed, "departures": departures}
     return _publish(args, comparison, figures)
 
@@ -203,7 +203,7 @@ def throw_hybrid(
     return rows
 
 
-def on_plant(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
+def label_throws(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
     """Return throws on a plant with what they are called; ``notes`` end the title."""
     from visthrow.throws.plants import PLANTS
 

@@ -81,6 +81,6 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
 def _write_table(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
     entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
-    comparison = compare.on_plant(plant, SEED, entries)
+    comparison = compare.label_throws(plant, SEED, entries)
     print(comparison.table(), flush=True)
     return comparison.write(folder)

@@ -25,7 +25,7 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
-def checked_number(
+def make_number_parser(
     kind: type, good: Callable[[float], bool], expected: str
 ) -> Callable[[str], float]:
     """Return what reads a number of the command line that must be good."""
@@ -39,16 +39,16 @@ def checked_number(
     return parse
 
 
-ABOVE_ZERO = checked_number(float, lambda x: 0.0 < x < math.inf, "a number above 0")
-WHOLE = checked_number(int, lambda x: x >= 0, "a whole number of 0 or more")
+ABOVE_ZERO = make_number_parser(float, lambda x: 0.0 < x < math.inf, "a number above 0")
+WHOLE = make_number_parser(int, lambda x: x >= 0, "a whole number of 0 or more")
 
 TYPES: Mapping[str, Callable[[str], Any]] = {
-    "number": checked_number(float, math.isfinite, "a finite number"),
+    "number": make_number_parser(float, math.isfinite, "a finite number"),
     "above zero": ABOVE_ZERO,
-    "distance": checked_number(float, lambda x: 0.0 <= x <= 3.0, "a distance from 0 to 3 m"),
+    "distance": make_number_parser(float, lambda x: 0.0 <= x <= 3.0, "a distance from 0 to 3 m"),
     "whole": WHOLE,
-    "count": checked_number(int, lambda x: x > 0, "a whole number of 1 or more"),
-    "port": checked_number(int, lambda x: 0 < x < 65536, "a port, 1 to 65535"),
+    "count": make_number_parser(int, lambda x: x > 0, "a whole number of 1 or more"),
+    "port": make_number_parser(int, lambda x: 0 < x < 65536, "a port, 1 to 65535"),
     "int": int,
     "float": float,
     "names": lambda text: text.split(","),

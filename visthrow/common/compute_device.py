@@ -14,7 +14,7 @@ def resolve(name: str = "auto") -> str:
     """
     import torch
 
-    return _chosen(name, torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    return _choose_device(name, torch.cuda.device_count() if torch.cuda.is_available() else 0)
 
 
 def resolve_for_warp(name: str = "auto") -> str:
@@ -27,10 +27,10 @@ def resolve_for_warp(name: str = "auto") -> str:
     from camera.warp_start import start
 
     start()
-    return _chosen(name, wp.get_cuda_device_count())
+    return _choose_device(name, wp.get_cuda_device_count())
 
 
-def _chosen(name: str, count: int) -> str:
+def _choose_device(name: str, count: int) -> str:
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
     device = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
     if device not in exists:

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from visthrow.common.rotations import turned
+from visthrow.common.rotations import rotate_by_small_angles
 
 
-def measured(
+def add_mocap_noise(
     truth: Mapping[str, np.ndarray], noise: Mapping[str, float], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Add noise to poses, ``pos_w`` and ``payload_pos_w`` [m], shape (N, 3), then ``quat_wb``,
@@ -18,5 +18,7 @@ def measured(
     samples = {}
     for name, values in truth.items():
         error = noise[name] * rng.standard_normal((len(values), 3))
-        samples[name] = turned(values, error) if name == "quat_wb" else values + error
+        samples[name] = (
+            rotate_by_small_angles(values, error) if name == "quat_wb" else values + error
+        )
     return samples

@@ -112,7 +112,7 @@ def continuous(quat: ndarray) -> ndarray:
     return quat * np.cumprod(np.append(1.0, signs))[:, None]
 
 
-def turned(quat: ndarray, angle: ndarray) -> ndarray:
+def rotate_by_small_angles(quat: ndarray, angle: ndarray) -> ndarray:
     """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape
     (N, 3).
     """

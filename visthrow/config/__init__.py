@@ -25,7 +25,14 @@ from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config import schema as _schema
 from visthrow.config.kinds import KINDS, kinds_of
-from visthrow.config.schema import BASE_KEY, NONE_WORD, ConfigTable, Leaf, dataclass_of, merged
+from visthrow.config.schema import (
+    BASE_KEY,
+    NONE_WORD,
+    ConfigTable,
+    Leaf,
+    dataclass_of,
+    merge_tables,
+)
 
 T = TypeVar("T")
 
@@ -214,7 +221,7 @@ def _complete(
         return tree
     if not isinstance(base, str):
         _schema.fail(name, BASE_KEY, f"got {base!r}; expected the path of one other file")
-    return merged(_read(schema, _lookup(schema, base, folder, name, BASE_KEY), stack), tree)
+    return merge_tables(_read(schema, _lookup(schema, base, folder, name, BASE_KEY), stack), tree)
 
 
 def _include(

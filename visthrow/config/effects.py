@@ -37,7 +37,7 @@ def random_effects() -> tuple[Any, ...]:
     return tuple(effect for table in _tables() for effect in table.random_effects.values())
 
 
-def chosen(names: Iterable[str]) -> dict[str, Any]:
+def choose_effects(names: Iterable[str]) -> dict[str, Any]:
     """Return the effects of these names in the order of the catalogue; ConfigError for one that it
     does not hold.
     """

@@ -194,7 +194,7 @@ def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | Con
             value = _describe(base)
             problem = f"got {value}; expected another table; {suggest(value, siblings)}"
             fail(item.source, _join(_join(path, key), BASE_KEY), problem)
-        return merged(row(base.value, (key, *above)), table)
+        return merge_tables(row(base.value, (key, *above)), table)
 
     return {key: row(key, ()) for key in node.items}
 
@@ -203,13 +203,13 @@ def _describe(node: Leaf | ConfigTable) -> str:
     return repr(node.value) if isinstance(node, Leaf) else "a table"
 
 
-def merged(base: ConfigTable, override: ConfigTable) -> ConfigTable:
+def merge_tables(base: ConfigTable, override: ConfigTable) -> ConfigTable:
     """Return one table with another's values on top of its own, table by table."""
     combined = ConfigTable(override.source, dict(base.items))
     for key, item in override.items.items():
         below = combined.items.get(key)
         if isinstance(item, ConfigTable) and isinstance(below, ConfigTable):
-            combined.items[key] = merged(below, item)
+            combined.items[key] = merge_tables(below, item)
         else:
             combined.items[key] = item
     return combined

@@ -94,8 +94,8 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
         weak = world < faults
         late = world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
-        gain = between(team.weak, part) if weak else 1.0
-        delay = between(team.late, part) if late else 0.0
+        gain = interpolate(team.weak, part) if weak else 1.0
+        delay = interpolate(team.late, part) if late else 0.0
         weakened = {"thrust.gain": tuple(gain * one for one in vehicle.thrust.gain)}
         delayed = dataclasses.replace(release, lag=release.lag + delay)
         vehicles += [changed(vehicle, weakened), *[vehicle] * (team.vehicles - 1)]
@@ -104,7 +104,7 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
 
 
-def between(interval: tuple[float, float], part: Any) -> Any:
+def interpolate(interval: tuple[float, float], part: Any) -> Any:
     """Value at this share of the way from the lower to the upper end."""
     low, high = interval
     return low + (high - low) * part

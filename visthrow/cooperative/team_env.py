@@ -17,7 +17,7 @@ from camera.keypoint_noise import DetectorView
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.common.compute_device import rounded_products
 from visthrow.common.free_fall import free_flight
-from visthrow.cooperative.team import TeamExperiment, between, layout_of, members
+from visthrow.cooperative.team import TeamExperiment, interpolate, layout_of, members
 from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
@@ -262,11 +262,11 @@ class TeamEnv(ThrowEpisodes):
         memory["tripped"].masked_fill_(fresh, 0.0)
         self.view.begin(rows)
         age = memory["pose_age"]
-        latency = between(task.observation.latency, torch.rand_like(age))
+        latency = interpolate(task.observation.latency, torch.rand_like(age))
         torch.where(rows, latency, age, out=age)
         age = memory["age"]
         part = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
-        torch.where(fresh, between(self.cfg.team.age, part), age, out=age)
+        torch.where(fresh, interpolate(self.cfg.team.age, part), age, out=age)
 
     def _form(self, fresh: Tensor) -> None:
         """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
@@ -275,14 +275,14 @@ class TeamEnv(ThrowEpisodes):
         goal = self.views.goal_w
         draw = torch.rand(self.worlds, 4, device=self.device)
         heading = 2.0 * math.pi * draw[:, 0]
-        distance = between(team.goal, draw[:, 1])
+        distance = interpolate(team.goal, draw[:, 1])
         x, y = (distance * part for part in (heading.cos(), heading.sin()))
         goals = torch.stack([x, y, torch.zeros_like(x)], -1)
         if self._goal is not None:
             goals = self._goal.expand_as(goals)
             heading = torch.atan2(goals[:, 1], goals[:, 0])
         spread = math.radians(team.across_deg) * (2.0 * draw[:, 2] - 1.0)
-        tilt = self._rows(torch.deg2rad(between(team.tilt_deg, draw[:, 3])))
+        tilt = self._rows(torch.deg2rad(interpolate(team.tilt_deg, draw[:, 3])))
         rows = torch.arange(self.rows, device=self.device)
         place = 2.0 * math.pi / self.team * (rows % self.team)
         azimuth = self._rows(heading + spread) + 0.5 * math.pi + place
@@ -314,7 +314,7 @@ class TeamEnv(ThrowEpisodes):
         poses = arrays.push(memory["poses"], torch.cat([vehicle, load], -1), fresh)
         memory["poses"].copy_(poses)
         period = self.cfg.sim.control_period
-        pose = arrays.at_latency(poses, memory["pose_age"] / period)
+        pose = arrays.interpolate_at_latency(poses, memory["pose_age"] / period)
         frame = self._measure(self._state_frame(pose, goal))
         valid = None
         if self.layout.name == "vision":
@@ -344,7 +344,7 @@ class TeamEnv(ThrowEpisodes):
         """
         noise = self.cfg.task.noise.observation_step
         age = self._rows(self.buffers["age"]) / self.cfg.sim.control_period
-        late = arrays.at_latency(poses, age)
+        late = arrays.interpolate_at_latency(poses, age)
         parts = []
         for k in range(1, self.team):
             neighbour = self._neighbour(late, k)

@@ -142,7 +142,7 @@ class RenderedEyes:
         valid = np.zeros((self.count, KEYPOINTS), bool)
         rots = rotation_from_quat(torch.from_numpy(np.array(measured.quat_wb, float))).numpy()
         if not self._followed:
-            self._followed = [self._hanging(rot) for rot in rots]
+            self._followed = [self._assume_hanging_ball(rot) for rot in rots]
         for e in range(self.count):
             picture = np.ascontiguousarray(pictures[e, ..., ::-1])
             detections = self._detect(
@@ -168,7 +168,7 @@ class RenderedEyes:
         self._refused = len(lost)
         return lost
 
-    def _hanging(self, rot_wb: ndarray) -> BallGoalTracker:
+    def _assume_hanging_ball(self, rot_wb: ndarray) -> BallGoalTracker:
         """Return a ball that hangs still below a vehicle: where it is looked for first."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
         return BallGoalTracker(

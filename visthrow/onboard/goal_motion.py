@@ -216,11 +216,14 @@ def _update_located(
     ball = rays[:, GOAL_KEYPOINTS] * hangs
     places = xp.concatenate([goal, ball, located], -1)
     return GoalEstimate(
-        sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, located)
+        sums,
+        moves,
+        places,
+        *predict_invisible_corners(layout, frame, valid, camera, rot_wb, goal_xy, located),
     )
 
 
-def predicted(
+def predict_invisible_corners(
     layout: Layout,
     frame: Array,
     valid: Array,

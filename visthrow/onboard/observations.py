@@ -131,7 +131,7 @@ def layout_of(params: Any) -> Layout:
     raise ValueError(f"observation layout {params.layout!r}; expected 'state' or 'vision'")
 
 
-def joined(parts: list[Array]) -> Array:
+def join_arrays(parts: list[Array]) -> Array:
     """Return arrays side by side."""
     return library(parts[0]).concatenate(parts, -1)
 
@@ -200,21 +200,21 @@ def rotation_in(frame: Array) -> Array:
 def vehicle_part(pos_w: Array, vel_w: Array, rate_b: Array, rot_wb: Array) -> Array:
     """Vehicle's part of a frame, shape (E, 15)."""
     parts = [pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]]
-    return joined(parts)
+    return join_arrays(parts)
 
 
 def state_part(pos_w: Array, goal_w: Array, payload_w: Array) -> Array:
     """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape
     (E, 5).
     """
-    return joined([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w])
+    return join_arrays([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w])
 
 
 def answer(frame: Array, previous_action: Array) -> Array:
     """Return the vehicle's response in one step, shape (E, 10): velocity, body rates, and the
     action before it.
     """
-    return joined([frame[:, 3:9], previous_action[:, :4]])
+    return join_arrays([frame[:, 3:9], previous_action[:, :4]])
 
 
 def observe(
@@ -272,4 +272,4 @@ def observe(
         history.reshape(len(frame), -1),
         attached[:, None],
     ]
-    return joined(parts + further), history
+    return join_arrays(parts + further), history

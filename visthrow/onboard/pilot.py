@@ -154,7 +154,7 @@ class Pilot:
         if camera_params is not None:
             self.camera = self._camera = KeypointCamera(camera_params)
             if count == 1:
-                self._camera = self.camera.on_arrays()
+                self._camera = self.camera.convert_to_arrays()
         self.spent = (0.0, 0.0)
         first = act.hover_action(GRAVITY * mass, self._max_thrust)
         self._first = np.array([first], dtype=np.float32)
@@ -335,7 +335,7 @@ class Pilot:
         part = ob.state_part(pos, goal, payload)
         if layout.name == "vision":
             part = points.reshape(len(points), -1)
-        frame = ob.joined([ob.vehicle_part(pos, vel, rate, rot), part])
+        frame = ob.join_arrays([ob.vehicle_part(pos, vel, rate, rot), part])
         filled = valid
         goal_fit = self._goal_fit
         answers = self._answers

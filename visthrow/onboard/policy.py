@@ -117,7 +117,7 @@ class Policy:
             raise PolicyError(
                 "this policy has a memory; expected a call of step or actor rather than act"
             )
-        return self.decide(self._fitting(obs))
+        return self.decide(self._check_shape(obs))
 
     def begin(self, count: int) -> Tensor:
         """Memory at the beginning of a throw, shape (E, H); H is 0 for a policy without one."""
@@ -135,7 +135,7 @@ class Policy:
 
         Raises PolicyError if the last axis of the observations is not D long.
         """
-        fitted = self._fitting(obs)
+        fitted = self._check_shape(obs)
         if self.estimator is not None:
             fitted, memory = self.estimator.step(fitted, memory)
         return self.decide(fitted), memory
@@ -155,7 +155,7 @@ class Policy:
 
         return act
 
-    def _fitting(self, obs: Tensor) -> Tensor:
+    def _check_shape(self, obs: Tensor) -> Tensor:
         if obs.shape[-1] != self.obs_dim:
             raise PolicyError(
                 f"got observations of shape {tuple(obs.shape)}; this policy expects (E,"

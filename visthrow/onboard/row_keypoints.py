@@ -26,8 +26,8 @@ def row_keypoints(
     """Return keypoints, float32, shape (1, 8, 2), and validity, shape (1, 8).
 
     Args:
-        camera: of `KeypointCamera.on_arrays`. The others: as of `camera.keypoints.keypoints`, with
-            a batch of one.
+        camera: of `KeypointCamera.convert_to_arrays`. The others: as of
+            `camera.keypoints.keypoints`, with a batch of one.
     """
     lens = camera.fisheye
     corners_w = np.append(goal_w[0, :2], np.float32(0.0)) + camera.square_w

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from numpy import ndarray
 from torch import Tensor
 
-from camera.arrays import by_torch
+from camera.arrays import wrap_for_arrays
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import ACTIVATIONS, Policy
 
@@ -41,7 +41,7 @@ def _activation(name: str) -> Callable[[ndarray], ndarray]:
     """Return an activation by rsl_rl's name."""
     if name == "elu":
         return _elu
-    return by_torch(getattr(F, ACTIVATIONS[name]["torch"]))
+    return wrap_for_arrays(getattr(F, ACTIVATIONS[name]["torch"]))
 
 
 class RowPolicy:

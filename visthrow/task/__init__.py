@@ -391,7 +391,11 @@ class Experiment:
                 f" {self.rope.payload_radius} m"
             )
             raise ConfigError(f"{message}; expected the same ball")
-        for wrong in () if self.fleet is not None else (*_out_of_place(self), *_no_vehicle(self)):
+        for wrong in (
+            ()
+            if self.fleet is not None
+            else (*_find_wrong_units(self), *_find_impossible_vehicle(self))
+        ):
             raise ConfigError(wrong)
 
 
@@ -417,7 +421,7 @@ def _largest_rates(vehicle: VehicleParams) -> Vector:
     return roll, pitch, yaw
 
 
-def _out_of_place(e: Experiment) -> Iterator[str]:
+def _find_wrong_units(e: Experiment) -> Iterator[str]:
     """Return the contradiction among an experiment's lengths: a number in another unit is
     off by a hundred or more.
     """
@@ -445,7 +449,7 @@ def _out_of_place(e: Experiment) -> Iterator[str]:
         )
 
 
-def _no_vehicle(e: Experiment) -> Iterator[str]:
+def _find_impossible_vehicle(e: Experiment) -> Iterator[str]:
     """Return the reason why an experiment's vehicle is impossible: thrust and weight, size, thrust
     and speed of the rotors.
     """
@@ -554,7 +558,7 @@ def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
 
     from sim.effects.effect import apply, possible_together
     from sim.effects.setting import Setting, generalise, specialise
-    from visthrow.config.effects import chosen
+    from visthrow.config.effects import choose_effects
 
     covariance = np.array(diagnosed.covariance)
     values, vectors = np.linalg.eigh(covariance)
@@ -565,7 +569,9 @@ def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
         )
     normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
     base = generalise(Setting(plant, experiment.sensing))
-    effects = {name: effect.bounded(base) for name, effect in chosen(diagnosed.effects).items()}
+    effects = {
+        name: effect.bounded(base) for name, effect in choose_effects(diagnosed.effects).items()
+    }
     plants = []
     for draw in normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T:
         theta = {

@@ -131,7 +131,7 @@ def members(experiment: Experiment) -> list[Member]:
     return vehicles
 
 
-def alone(experiment: Experiment, number: int = 0) -> Experiment:
+def single_vehicle(experiment: Experiment, number: int = 0) -> Experiment:
     """Return the experiment of one vehicle of the fleet, stated in SI units, vehicle and task
     alike; no fleet any more.
     """
@@ -157,7 +157,7 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     return changed(experiment, values)
 
 
-def specialised(
+def specialise(
     policy: Policy, experiment: Experiment, number: int = 0
 ) -> tuple[Policy, Experiment]:
     """Policy for one vehicle of the fleet that the policy was trained for: an ordinary one, in SI
@@ -177,7 +177,7 @@ def specialised(
             "policy with a contract of one vehicle; expected one that was trained for a fleet, with"
             " setup given"
         )
-    one = alone(experiment, number)
+    one = single_vehicle(experiment, number)
     chosen = members(experiment)[number]
     layout = ob.layout_of(experiment.task.observation)
     sizes = _sizes(layout, chosen.units)

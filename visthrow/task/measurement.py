@@ -72,7 +72,7 @@ class Throws:
     # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
     goal_w: ndarray | None = None
 
-    def within(self, error: float) -> bool:
+    def land_within(self, error: float) -> bool:
         """Whether they land so near on average [m], and all but one in twenty land."""
         return (
             bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error

@@ -183,19 +183,19 @@ def throw(seconds: float | None = None) -> Phase:
     what the bounds allow.
     """
 
-    def over(flight: "Flight") -> bool:
+    def is_over(flight: "Flight") -> bool:
         if seconds is None:
             longest = flight.pilots.experiment.task.bounds.time_limit + FALL_TIME
         else:
             longest = seconds
-        return not np.any(flight.open) or flight.lasted(longest)
+        return not np.any(flight.open) or flight.has_lasted(longest)
 
-    return Phase(True, over)
+    return Phase(True, is_over)
 
 
 def hover(seconds: float) -> Phase:
     """Hover for a time [s]."""
-    return Phase(False, lambda flight: flight.lasted(seconds))
+    return Phase(False, lambda flight: flight.has_lasted(seconds))
 
 
 class Flight:
@@ -250,7 +250,7 @@ class Flight:
     def elapsed(self) -> float:
         return self.plant.time - self._phase_begin
 
-    def lasted(self, time: float) -> bool:
+    def has_lasted(self, time: float) -> bool:
         """Whether the phase has lasted for a time [s], to the nearest period."""
         return self.elapsed > time - 0.5 * self.plant.period
 

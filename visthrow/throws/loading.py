@@ -11,7 +11,7 @@ from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
 from visthrow.onboard.policy import Policy, find_policy, flatten
 from visthrow.task import Experiment, contract_of, load_experiment
-from visthrow.task.fleet import specialised
+from visthrow.task.fleet import specialise
 
 Kind = TypeVar("Kind", bound=Experiment)
 
@@ -73,7 +73,7 @@ def load_policy(
             f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
         ) from None
     if experiment.fleet is not None:  # one vehicle is flown, that of the config
-        policy, experiment = specialised(policy, changed(experiment, {"fleet.count": 0}))
+        policy, experiment = specialise(policy, changed(experiment, {"fleet.count": 0}))
     return Loaded(
         path.stem if path.stem != "policy" else path.resolve().parent.name,
         policy,

@@ -17,7 +17,7 @@ from sim.reference.snapshot import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.free_fall import GRAVITY, free_flight
-from visthrow.common.rotations import cross, rotate, turned
+from visthrow.common.rotations import cross, rotate, rotate_by_small_angles
 from visthrow.task import Experiment, NoiseParams, plant_of
 from visthrow.throws.loose_rope import LooseRope
 
@@ -252,7 +252,7 @@ class HybridPlant:
         landing = self.landing
         since = np.nan_to_num(self.time - self._separation)
         start = self.look("payload_pos_w", "payload_vel_w")
-        pos, vel = flown(self.params.rope, self.params.air, *start, since)
+        pos, vel = fly_payloads(self.params.rope, self.params.air, *start, since)
         down = landing.landed[:, None]
         return np.where(down, landing.point_w, pos), np.where(down, 0.0, vel)
 
@@ -292,7 +292,7 @@ class HybridPlant:
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
             self._error = self._bias + step
-        return self._erring(self.exposed)
+        return self._add_error(self.exposed)
 
     @property
     def exposed(self) -> Snapshot:
@@ -304,15 +304,15 @@ class HybridPlant:
 
         The pilot hears of it late, by a chord between two control steps as in training; sensors
         know no chord."""
-        return self._erring(self.state)
+        return self._add_error(self.state)
 
-    def _erring(self, snapshot: Snapshot) -> Snapshot:
+    def _add_error(self, snapshot: Snapshot) -> Snapshot:
         if self.noise is None:
             return snapshot
         *errors, turn = self._error
         names = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
         values = {name: getattr(snapshot, name) + error for name, error in zip(names, errors)}
-        return replace(snapshot, **values, quat_wb=turned(snapshot.quat_wb, turn))
+        return replace(snapshot, **values, quat_wb=rotate_by_small_angles(snapshot.quat_wb, turn))
 
     @property
     def landing(self) -> PayloadLandings:
@@ -363,7 +363,7 @@ class ReferenceAdapter:
         return self.sample
 
 
-def flown(
+def fly_payloads(
     rope: RopeParams, air: AirParams, pos_w: ndarray, vel_w: ndarray, time: ndarray
 ) -> tuple[ndarray, ndarray]:
     """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,),

@@ -151,14 +151,14 @@ def fly(
     def let_go(flight: Flight) -> bool:
         return not np.any(flight.open & flight.now.attached)
 
-    flight.run([_hovering(hangs_still, home, HOVER_LEAST, HOVER_MOST), Phase(True, let_go)])
+    flight.run([_hover_until(hangs_still, home, HOVER_LEAST, HOVER_MOST), Phase(True, let_go)])
     recovery = plant.time
 
-    def recovered(snapshot: Snapshot) -> bool:  # the payload lies on the ground or hangs still
+    def has_recovered(snapshot: Snapshot) -> bool:  # the payload lies on the ground or hangs still
         at_rest = plant.landing.landed[0] or snapshot.attached[0]
         return _speed(snapshot.vel_w) < QUIET_SPEED and bool(at_rest)
 
-    flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
+    flight.run([_hover_until(has_recovered, home, 0.0, RECOVERY_MOST)])
     return _finish(flight, recording, recovery)
 
 
@@ -190,13 +190,13 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: ndarray, seed: int) -> dict[s
     }
 
 
-def _hovering(
+def _hover_until(
     quiet: Callable[[Snapshot], bool], home: ndarray, shortest: float, longest: float
 ) -> Phase:
     """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
     calm = 0.0
 
-    def finished(flight: Flight) -> bool:
+    def is_finished(flight: Flight) -> bool:
         nonlocal calm
         close = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
         calm = calm + flight.plant.period if close and quiet(flight.now) else 0.0
@@ -204,7 +204,7 @@ def _hovering(
             calm >= QUIET_TIME or flight.elapsed >= longest
         )
 
-    return Phase(False, finished)
+    return Phase(False, is_finished)
 
 
 def _finish(flight: Flight, recording: ThrowRecorder, recovery: float) -> FlightLog:

@@ -64,7 +64,7 @@ class EstimatorNetwork(nn.Module):
         self.register_buffer("kept", passed)
         self.register_buffer("learnt", learnt.float())
 
-    def frozen(self) -> Estimator:
+    def freeze(self) -> Estimator:
         """Return the estimator that flies; it shares the parameters."""
         gru = self.gru
         normaliser = self.normalizer
@@ -133,7 +133,7 @@ class Distillation(Algorithm):
         self._truth = torch.zeros(T, E, layout.dimension, device=device)
         self._alive = torch.zeros(T, E, device=device)
         self._history = torch.zeros(E, 1 + layout.history, layout.payload, device=device)
-        self._flying = self.network.frozen()
+        self._flying = self.network.freeze()
         self.average = average_weights(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
         weights = self.network.parameters()
@@ -215,12 +215,12 @@ class Distillation(Algorithm):
         tensors.
         """
         flying = self._flying.parts()
-        for name, value in self.network.frozen().parts().items():
+        for name, value in self.network.freeze().parts().items():
             flying[name].copy_(value)
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         t = self.teacher.to("cpu")
-        parts = self.average.module.frozen().parts()
+        parts = self.average.module.freeze().parts()
         estimator = Estimator.from_parts({name: part.cpu().clone() for name, part in parts.items()})
         return replace(t, contract=contract, made_by=made_by, estimator=estimator)
 
@@ -228,7 +228,7 @@ class Distillation(Algorithm):
         e = policy.estimator
         n = self.network
         parts = e.parts()
-        taken = n.frozen().parts()  # the network's own memory, but for the masked output's
+        taken = n.freeze().parts()  # the network's own memory, but for the masked output's
         if {k: v.shape for k, v in parts.items()} != {k: v.shape for k, v in taken.items()}:
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"

@@ -27,7 +27,7 @@ from visthrow.task import Experiment
 from visthrow.task.measurement import Throws
 from visthrow.training.progress import TrainLog
 from visthrow.training.ranks import Ranks
-from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, fitted
+from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, adopt_layers, finish
 
 EVALUATION_TARGET = 2.0  # [m]
 
@@ -109,7 +109,7 @@ def _begin(args: Namespace, path: Path, folder: Path) -> tuple:
         return config.load(Experiment, path, args.overrides), None, seed
     policy = Policy.load(find_policy(args.start))
     experiment = config.load(Experiment, path, [ADAPTATION, *args.overrides])
-    return fitted(experiment, policy), policy, seed
+    return adopt_layers(experiment, policy), policy, seed
 
 
 def _resume(args: Namespace, path: Path | None, folder: Path) -> tuple:
@@ -169,7 +169,7 @@ class Regularly:
         return time.perf_counter() > self._next
 
     @contextlib.contextmanager
-    def timed(self) -> Iterator[None]:
+    def measure_cost(self) -> Iterator[None]:
         """Measure what one costs."""
         begin = time.perf_counter()
         yield
@@ -200,15 +200,15 @@ def _loop(args: Namespace, trainer, folder: Path, last: int) -> str:
                 figures = trainer.step()
                 throws = None
                 if evaluates and evaluations.due(trainer.iteration):
-                    with evaluations.timed():
+                    with evaluations.measure_cost():
                         throws = trainer.throw(EVALUATION_TARGET)
                 if log:
                     log.row(figures, throws)
                 if ranks.agree(checkpoints.due(trainer.iteration)):
-                    with checkpoints.timed():
+                    with checkpoints.measure_cost():
                         trainer.save(folder / CHECKPOINT)
                     saved = trainer.iteration
-                if args.until and throws is not None and throws.within(args.until):
+                if args.until and throws is not None and throws.land_within(args.until):
                     why = REACHED
                 elif trainer.iteration < last and stop.asked:
                     why = STOPPED

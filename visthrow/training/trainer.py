@@ -67,7 +67,7 @@ def coarsen(experiment: Experiment) -> Experiment:
     return dataclasses.replace(experiment, rope=rope, sim=sim)
 
 
-def fitted(experiment: Experiment, policy: Policy) -> Experiment:
+def adopt_layers(experiment: Experiment, policy: Policy) -> Experiment:
     """Return the experiment with the policy's layers as its actor's, for a training that starts
     from the policy.
 

@@ -119,14 +119,14 @@ def _place(time: float, topic: str, pose: dict[str, Any]) -> Message:
 def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
     """Rope, ball and goal as things of the 3D panel."""
 
-    def thing(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
+    def make_message(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
         entity = {"frame_id": "world", "id": name, "frame_locked": False, kind: [shape]}
         return time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entity]}
 
     for time, row in _rows(log, "cable_points_w"):
         points = [_name("xyz", point) for point in row]
         line = {"pose": _pose((0.0, 0.0, 0.0)), "points": points}
-        yield thing(time, "rope", "lines", line | SCENE["rope"])
+        yield make_message(time, "rope", "lines", line | SCENE["rope"])
     width = 2.0 * experiment.rope.payload_radius
     side = experiment.camera.goal_side
     solids = (
@@ -136,7 +136,7 @@ def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
     for channel, name, kind, size in solids:
         for time, row in _rows(log, channel):
             solid = {"pose": _pose(row), "size": _name("xyz", size)}
-            yield thing(time, name, kind, solid | SCENE[name])
+            yield make_message(time, name, kind, solid | SCENE[name])
 
 
 def _pictures(log: FlightLog, experiment: Any) -> Iterator[Message]:

@@ -42,7 +42,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 def send_whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
     """Send all of a flight; arguments as of :func:`write`."""
-    still(stream, log.meta["goal_w"], experiment)
+    draw_still_parts(stream, log.meta["goal_w"], experiment)
     send(stream, log)
     if "landing" in log:
         _landing(stream, log)
@@ -101,7 +101,7 @@ LOOKS = _looks()
 """Entity -> how the viewer draws it."""
 
 
-def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
+def draw_still_parts(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
     """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is
     at ``goal_w`` [m], shape (3,).
     """
@@ -133,8 +133,8 @@ def _draw_scene(stream: rr.RecordingStream, goal: ndarray, experiment: Any) -> N
 
 
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Send all that moves, from a whole flight or from a piece of one; see :func:`still` for the
-    rest.
+    """Send all that moves, from a whole flight or from a piece of one; see :func:`draw_still_parts`
+    for the rest.
     """
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)

@@ -41,7 +41,7 @@ HEADER = (
 )
 
 
-def of_paper(name: str, target: float) -> str:
+def format_paper_result(name: str, target: float) -> str:
     """Return the paper's error and duration, mean and deviation, as text; "-" without them."""
     paper = PAPER.get((name, target))
     return "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
@@ -56,7 +56,7 @@ def markdown(rows: Sequence[dict], title: str) -> str:
 
 def _cells(row: dict) -> tuple[str, ...]:
     head = (row["policy"], f"{row['target']:.1f}", str(row["throws"]))
-    paper = of_paper(row["layout"], row["target"])
+    paper = format_paper_result(row["layout"], row["target"])
     success = f"{100 * row['success']:.1f} %"
     if not row["success"]:
         return (*head, "-", "-", success, "-", "-", paper)

@@ -55,7 +55,7 @@ class Show:
         self._samples = TickLogger(playback, provenance, start)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
         self._said: list | None = None
-        rerun_view.still(
+        rerun_view.draw_still_parts(
             stream, self._samples.recorder.meta["goal_w"], sizes(playback.runner.pilot)
         )
 

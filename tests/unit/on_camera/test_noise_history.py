@@ -3,7 +3,7 @@
 import torch
 from pytest import approx, mark
 
-from camera.arrays import at_latency
+from camera.arrays import interpolate_at_latency
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.params import KeypointNoiseParams
 
@@ -21,8 +21,10 @@ def test_latency_interpolates_between_whole_steps():
     history = torch.tensor([[0.0, 1.0, 4.0, 9.0]]).repeat(4, 1)
     latency = torch.tensor([0.0, 1.0, 1.25, 7.0])
     # 1 + 0.25 (4 - 1) = 1.75; beyond the history its oldest value.
-    assert torch.allclose(at_latency(history, latency), torch.tensor([0.0, 1.0, 1.75, 9.0]))
-    assert torch.allclose(at_latency(history, torch.tensor(2.5)), torch.full((4,), 6.5))
+    assert torch.allclose(
+        interpolate_at_latency(history, latency), torch.tensor([0.0, 1.0, 1.75, 9.0])
+    )
+    assert torch.allclose(interpolate_at_latency(history, torch.tensor(2.5)), torch.full((4,), 6.5))
 
 
 def test_latency_is_valid_only_where_all_that_it_used_was():

@@ -35,7 +35,7 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
     if lens == "at the payload":
         params = replace(params, mount=replace(params.mount, position_b=(0.0, 0.0, 0.0)))
     camera = KeypointCamera(params)
-    arrays = camera.on_arrays()
+    arrays = camera.convert_to_arrays()
     rng = np.random.default_rng(0)
     count = 200
     quat = rng.normal(size=(count, 4))

@@ -20,7 +20,7 @@ from visthrow.paper import results
 from visthrow.paper.sweep import pool
 from visthrow.paper.sweep import work_units as units
 from visthrow.paper.sweep.sweep_record import collect, status
-from visthrow.paper.sweep.work import held, locked
+from visthrow.paper.sweep.work import hold_lock, is_locked
 from visthrow.paper.sweep.work_units import load_list
 
 LIST = """
@@ -263,20 +263,22 @@ def test_what_another_process_has_is_tried_again(path, tmp_path):
 
 def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     path = tmp_path / "locks" / "a.lock"
-    code = "import time; from pathlib import Path; from visthrow.paper.sweep.work import locked\n"
-    code += f"with locked(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
+    code = (
+        "import time; from pathlib import Path; from visthrow.paper.sweep.work import hold_lock\n"
+    )
+    code += f"with hold_lock(Path({str(path)!r})): print(1, flush=True); time.sleep(60)"
     other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     try:
         assert other.stdout.readline() == b"1\n"
-        assert held(path)
-        with raises(BusyError, match=str(other.pid)), locked(path):
+        assert is_locked(path)
+        with raises(BusyError, match=str(other.pid)), hold_lock(path):
             pass
         other.send_signal(signal.SIGKILL)
         other.wait()
-        eventually(lambda: not held(path))
-        with locked(path):
-            assert held(path)
-        assert not held(path)
+        eventually(lambda: not is_locked(path))
+        with hold_lock(path):
+            assert is_locked(path)
+        assert not is_locked(path)
     finally:
         other.kill()
 

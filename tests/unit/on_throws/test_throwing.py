@@ -446,5 +446,5 @@ def test_throws_are_within_an_error_only_where_nearly_all_land():
     for failures, within in ((5, True), (6, False)):
         success = np.arange(100) >= failures
         throws = Throws(1.5, success, np.zeros((100, 2)), error, error, error, error)
-        assert throws.within(0.11) is within
-        assert not throws.within(0.09)
+        assert throws.land_within(0.11) is within
+        assert not throws.land_within(0.09)

@@ -79,7 +79,7 @@ def test_weights_get_what_autograd_gives_them():
     fo.rollout()
     assert fo.derivatives()["cost"].isfinite()
     shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
-    fo.layers.gradients(fo.flights.flown(), shares)
+    fo.layers.gradients(fo.flights.mark_flown_steps(), shares)
     by_action = fo.layers.by_action * shares[:, None]
     parameters = list(fo.network.mlp.parameters())
     expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)
@@ -260,14 +260,14 @@ def test_a_rope_costs_before_it_is_slack():
         response=torch.zeros(9, 24, 4),
         action=torch.zeros(8, 24, 5),
     )
-    rest = fo._carrying(x)
+    rest = fo._reward_carrying(x)
     assert_close(fo._pull(x), torch.ones(8, 24), atol=1e-5, rtol=0)
     costs = []
     for share in (0.5, 0.7, 1.0):
         x.load_vel = (share * GRAVITY * steps[..., None] * down).expand(shape)
         assert_close(fo._pull(x), torch.full((8, 24), 1.0 - share), atol=1e-4, rtol=0)
         moving = rewards.kinetic(fo.experiment.task.reward, x.vel[1:], x.vel[1:], x.load_vel[1:])
-        costs.append((rest + moving - fo._carrying(x)).mean().item())
+        costs.append((rest + moving - fo._reward_carrying(x)).mean().item())
     assert costs[0] == approx(0.0, abs=1e-4)
     assert costs[2] > costs[1] > 0.1
 

@@ -9,7 +9,7 @@ from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training.trainer import fitted
+from visthrow.training.trainer import adopt_layers
 
 
 @mark.parametrize(
@@ -93,7 +93,9 @@ def test_the_thrust_of_an_action_is_the_vehicles_unless_it_is_set():
     weaker = load_experiment("state", [*sets, "task.action.max_thrust=30"])
     assert weaker.task.action.max_thrust == 30.0
     shipped = Policy.load(find_policy("state"))
-    assert fitted(heavy, shipped).task.action == heavy.task.action  # a throttle fits any vehicle
+    assert (
+        adopt_layers(heavy, shipped).task.action == heavy.task.action
+    )  # a throttle fits any vehicle
 
 
 @mark.parametrize(

@@ -19,7 +19,7 @@ from visthrow.onboard import actions as act
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of, plant_of
-from visthrow.task.fleet import alone, members, specialised
+from visthrow.task.fleet import members, single_vehicle, specialise
 from visthrow.throws.loading import load_policy
 from visthrow.throws.recorded import fly
 from visthrow.training.env import ThrowEnv
@@ -131,7 +131,7 @@ def test_the_environment_flies_every_vehicle_with_its_limits_and_reports_them():
 def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name, kind):
     base = of(name, kind, [*QUIET, "task.start.mass=0.0", "task.start.tether_variants=1"])
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
-    specialist, one = specialised(policy, base)
+    specialist, one = specialise(policy, base)
     pilot, units = (
         Pilot(specialist, one.camera if kind == "any_vision" else None, 4),
         members(base)[0].units,
@@ -164,7 +164,7 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
 
 
 def test_one_vehicles_experiment_is_the_same_task_at_its_size():
-    one = alone(of("x500"))
+    one = single_vehicle(of("x500"))
     size, usual = 0.8 / 0.33, load_experiment("any")
     assert one.fleet is None
     assert one.task.observation.setup == "none"
@@ -181,7 +181,7 @@ def test_a_policy_of_one_vehicle_is_not_specialised():
     with raises(
         PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"
     ):
-        specialised(random_policy(base), of("x500"))
+        specialise(random_policy(base), of("x500"))
 
 
 def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(tmp_path):

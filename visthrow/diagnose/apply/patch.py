@@ -18,7 +18,7 @@ from sim.params import GRAVITY, LawParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.toml_text import dumps
-from visthrow.config.effects import catalogue, chosen
+from visthrow.config.effects import catalogue, choose_effects
 from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.inputs.fit import list_covariance
 from visthrow.diagnose.inputs.setup import Setup
@@ -34,7 +34,7 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
     Raises ConfigError: an effect that the catalogue does not hold.
     """
     base = generalise(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
-    sizes = apply(chosen(theta), base, theta)
+    sizes = apply(choose_effects(theta), base, theta)
     plant = specialise(sizes.plant, plant_of(experiment))
     return dataclasses.replace(
         experiment,

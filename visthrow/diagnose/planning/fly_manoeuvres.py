@@ -28,7 +28,7 @@ from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import load_experiment, plant_of
-from visthrow.throws.plants import flown
+from visthrow.throws.plants import fly_payloads
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
@@ -261,7 +261,7 @@ class SimulatedFlight:
         """
         poses = {"pos_w": self.origin_w}
         poses |= {name: self.truth[name] for name in ("payload_pos_w", "quat_wb")}
-        values = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
+        values = mocap.add_mocap_noise(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         if voltage:
             values["battery_voltage"] = self.truth["voltage"]
         sent = {"command": self.commands, "release_command": self.manoeuvre.release.astype(float)}
@@ -366,7 +366,7 @@ def fly(
     vel_w, fallen = map(np.array, zip(*falls))
     loose = fallen > 0.0
     begin = truth["payload_pos_w"][loose], vel_w[loose]
-    truth["payload_pos_w"][loose] = flown(plant.rope, plant.air, *begin, fallen[loose])[0]
+    truth["payload_pos_w"][loose] = fly_payloads(plant.rope, plant.air, *begin, fallen[loose])[0]
     sent = np.array(commands)
     flights = []
     for e, manoeuvre in enumerate(manoeuvres):

@@ -349,7 +349,7 @@ class _Tracking(Scores):
                 vel,
             )
 
-    def flown(self, flight: Flight) -> Flown:
+    def collect_results(self, flight: Flight) -> Flown:
         """Results of all throws."""
         columns = self.columns(flight)
         columns["tracking"] = np.sqrt(self._sum / np.maximum(self._due, 1))
@@ -379,4 +379,4 @@ def fly_plant(
     flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)
     before = [] if plant_name == "hybrid" else [hover(HOVER_TIME)]
     flight.run([*before, throw(pilots.most * plant.period)])
-    return tracking.flown(flight)
+    return tracking.collect_results(flight)

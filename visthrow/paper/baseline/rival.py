@@ -26,7 +26,7 @@ def throw_baseline(args: argparse.Namespace) -> list[Entry]:
         for target in args.targets
     ]
     with tempfile.TemporaryDirectory() as folder:
-        flights = thrower.flown(sets, folder, status)
+        flights = thrower.fly_units(sets, folder, status)
     status("")
     throws = [
         Throws(flight.unit["target"], **{field: flight.columns[field] for field in FIELDS})

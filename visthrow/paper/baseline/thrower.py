@@ -156,7 +156,7 @@ def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
     return [(IDEAL, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
 
 
-def flown(
+def fly_units(
     sets: Sequence[list[Unit]], folder: str | Path, say: Callable[[str], None]
 ) -> list[Result]:
     """Results of sets of units, the batches of each joined; those that the folder holds are not

@@ -47,10 +47,10 @@ def run(args: argparse.Namespace) -> int:
         args.plants = []
     by_target = list(_list_units(args, bounds))
     swept = [] if args.no_sweep else list(_swept(args, bounds))
-    flights = thrower.flown(by_target + swept, out / "throws", status)
+    flights = thrower.fly_units(by_target + swept, out / "throws", status)
     rows = flights[: len(by_target)]
     front = flights[len(by_target) :]
-    document = [Section("baseline", "By target", (trade.by_target(rows),))]
+    document = [Section("baseline", "By target", (trade.target_table(rows),))]
     if swept:
         policies = [_throw(name, args) for name in args.policies]
         kinds = [(thrower.IDEAL, "none"), *((plant, "both") for plant in args.plants)]

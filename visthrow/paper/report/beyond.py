@@ -37,14 +37,18 @@ def section(thrown: ResultSet) -> Section:
     )
     rows = []
     missing = []
-    moving = _moving(thrown, missing)
+    moving = _moving_goal_rows(thrown, missing)
     for variant in ("payload", "drag", "far"):
-        results = thrown.matching(kind="policy", variant=variant)
+        results = thrown.find_results(kind="policy", variant=variant)
         if not results:
             missing.append(TITLES[variant])
         rows += _rows(results)
     rows += _rows(
-        [r for r in thrown.matching(kind="policy") if r.unit["policy"] in SHIPPED and _is_beyond(r)]
+        [
+            r
+            for r in thrown.find_results(kind="policy")
+            if r.unit["policy"] in SHIPPED and _is_beyond(r)
+        ]
     )
     header = (
         "policy | training | plant | flown with | target [m] | throws | landed | landing error [m]"
@@ -99,8 +103,8 @@ def _speeds(thrown: ResultSet, policy: str, plant: str) -> Points:
     return sorted(points, key=lambda point: point[0])
 
 
-def _moving(thrown: ResultSet, missing: list[str]) -> list:
-    names = sorted({r.unit["policy"] for r in thrown.matching(kind="policy", variant="moving")})
+def _moving_goal_rows(thrown: ResultSet, missing: list[str]) -> list:
+    names = sorted({r.unit["policy"] for r in thrown.find_results(kind="policy", variant="moving")})
     if not names:
         missing.append(TITLES["moving"])
     lines = []
@@ -112,7 +116,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
                 label = policy
                 if policy in SHIPPED:
                     label = f"{policy}, {TITLES['full']}"
-                    reference = thrown.shipped(policy, plant, TARGET)
+                    reference = thrown.shipped_throws(policy, plant, TARGET)
                     if reference is not None and points[0][0] > 0.0:
                         points = [(0.0, reference), *points]
                 if len(points) > 1:

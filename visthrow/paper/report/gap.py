@@ -95,7 +95,7 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
         round(sweep.scale * float(np.mean(value)), 9): r
         for value, r in thrown.throws_by_value(policy, sweep.key, PLANT, TARGET)
     }
-    nominal = thrown.shipped(policy, PLANT, TARGET)
+    nominal = thrown.shipped_throws(policy, PLANT, TARGET)
     if nominal is not None and points:
         points[sweep.trained_at] = nominal
     return sorted(points.items())

@@ -53,12 +53,12 @@ class ResultSet:
         """
         if departures is not ANY:
             conditions |= {"departures": departures}
-        matching = self.matching(kind="policy", plant=plant, target=target, **conditions)
+        matching = self.find_results(kind="policy", plant=plant, target=target, **conditions)
         ascending = sorted(matching[::-1], key=lambda result: result.unit["throws"])
         best = {result.unit["policy"]: result for result in ascending}
         return [best[name] for name in sorted(best)]
 
-    def shipped(self, name: str, plant: str, target: float) -> Result | None:
+    def shipped_throws(self, name: str, plant: str, target: float) -> Result | None:
         """Throws of a shipped policy under its own conditions."""
         return next(iter(self.policies(plant, target, {}, policy=name)), None)
 
@@ -74,7 +74,7 @@ class ResultSet:
             if result.unit["policy"] not in SHIPPED and result.good.any()
         ]
 
-    def matching(self, **conditions: Any) -> list[Result]:
+    def find_results(self, **conditions: Any) -> list[Result]:
         """Results whose unit has these entries."""
         return [
             r
@@ -90,7 +90,7 @@ class ResultSet:
         """
         return [
             (r.unit["departures"][key], r)
-            for r in self.matching(kind="policy", policy=policy, plant=plant, target=target)
+            for r in self.find_results(kind="policy", policy=policy, plant=plant, target=target)
             if list(r.unit["departures"]) == [key] and r.good.any()
         ]
 
@@ -131,7 +131,7 @@ def errors(results: Iterable[Result]) -> list[ndarray]:
     return [result.of("error") for result in results if result.good.any()]
 
 
-def landed(*results: Result, digits: int = 1) -> str:
+def format_landed_share(*results: Result, digits: int = 1) -> str:
     """Share of throws that landed."""
     return f"{100 * np.mean(np.concatenate([result.good for result in results])):.{digits}f} %"
 
@@ -145,7 +145,7 @@ def cells(*results: Result) -> dict[str, str]:
         "target [m]": f"{unit['target']:.1f}",
         "trainings": str(len(results)),
         "throws": str(sum(len(result.good) for result in results)),
-        "landed": landed(*results),
+        "landed": format_landed_share(*results),
     }
     if landings := errors(results):
         durations = [result.of("duration") for result in results if result.good.any()]

@@ -12,7 +12,7 @@ from visthrow.task.measurement import TARGETS
 from visthrow.throws.plants import PLANTS
 from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text, section
-from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
+from visthrow.view.tables import PAPER, PAPER_NOTE, format_paper_result
 
 ERROR = "landing error [m], mean and 95 % interval"
 VEHICLE = "the paper's vehicle: error [m], duration [s]"
@@ -25,7 +25,7 @@ def throws_section(thrown: ResultSet) -> Section:
     rows = []
     missing = []
     for name, target, plant in product(SHIPPED, TARGETS, PLANTS):
-        result = thrown.shipped(name, plant, target)
+        result = thrown.shipped_throws(name, plant, target)
         if result is not None:
             rows.append(_row(result))
         elif is_reported(plant, target):
@@ -60,7 +60,7 @@ def is_reported(plant: str, target: float) -> bool:
 
 def _row(result: Result) -> dict[str, str]:
     row = cells(result)
-    row[VEHICLE] = of_paper(result.unit["policy"], result.unit["target"])
+    row[VEHICLE] = format_paper_result(result.unit["policy"], result.unit["target"])
     if result.good.any():
         bias = st.bias(result.miss)
         row[ERROR] = row["landing error [m]"]
@@ -74,7 +74,7 @@ def _scatter(thrown: ResultSet) -> Picture | None:
     for plant in ("reference-realistic", "hybrid"):
         panels = []
         for target in TARGETS:
-            sets = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
+            sets = [(name, thrown.shipped_throws(name, plant, target)) for name in SHIPPED]
             series = [
                 (f"{name} policy", result.miss)
                 for name, result in sets
@@ -156,7 +156,7 @@ def _groups(
     vision, state = (thrown.seeds(name, "full", plant, target, {}) for name in SHIPPED[::-1])
     if min(len(vision), len(state)) >= 2:
         return vision, state, f"{len(vision)} and {len(state)} trainings"
-    shipped = [thrown.shipped(name, plant, target) for name in SHIPPED[::-1]]
+    shipped = [thrown.shipped_throws(name, plant, target) for name in SHIPPED[::-1]]
     if any(result is None or not result.good.any() for result in shipped):
         return None
     return shipped[:1], shipped[1:], "shipped"

@@ -14,12 +14,19 @@ from visthrow.paper.baseline import front, thrower
 from visthrow.paper.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.paper.baseline.thrower import BOUNDS
 from visthrow.paper.report import charts
-from visthrow.paper.report.result_set import SHIPPED, SHORT, WORDS, ResultSet, cells, landed
+from visthrow.paper.report.result_set import (
+    SHIPPED,
+    SHORT,
+    WORDS,
+    ResultSet,
+    cells,
+    format_landed_share,
+)
 from visthrow.paper.results import Result
 from visthrow.task.measurement import TARGETS
 from visthrow.view import parts
 from visthrow.view.parts import Grid, Picture, Section, Text
-from visthrow.view.tables import PAPER, PAPER_FRONT, of_paper
+from visthrow.view.tables import PAPER, PAPER_FRONT, format_paper_result
 
 DRAWS = 800  # bootstrap samples of a hypervolume
 
@@ -29,7 +36,7 @@ policies on it; the first is the paper's comparison.
 """
 
 
-def _default(result: Result) -> bool:
+def _has_defaults(result: Result) -> bool:
     """Whether speed and weights are those of the throws by target."""
     unit = result.unit
     default = thrower.unit(unit["plant"], unit["compensation"], unit["target"], 1)
@@ -57,7 +64,7 @@ def baseline_section(thrown: ResultSet) -> Section:
         " aerodynamics. On the plants it flies the same throws as the policies, with none, most or"
         " all of the known delays made up for."
     )
-    tables = [by_target(rows), Text(_bar(thrown), "finding")] if rows else []
+    tables = [target_table(rows), Text(_bar(thrown), "finding")] if rows else []
     return parts.section(
         "baseline",
         "The model-based baseline",
@@ -72,7 +79,9 @@ def baseline_section(thrown: ResultSet) -> Section:
 def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Result | None:
     """Throws at the speed and with the weights of the throws by target, the most there are."""
     selected = [
-        r for r in _find_baseline(thrown, plant, target, compensation=compensation) if _default(r)
+        r
+        for r in _find_baseline(thrown, plant, target, compensation=compensation)
+        if _has_defaults(r)
     ]
     return max(selected, key=lambda r: r.unit["throws"], default=None)
 
@@ -80,10 +89,10 @@ def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Re
 def _find_baseline(
     thrown: ResultSet, plant: str, target: float = FRONT_TARGET, **conditions: str
 ) -> list[Result]:
-    return thrown.matching(kind="baseline", plant=plant, target=target, **conditions)
+    return thrown.find_results(kind="baseline", plant=plant, target=target, **conditions)
 
 
-def by_target(results: Sequence[Result]) -> Grid | None:
+def target_table(results: Sequence[Result]) -> Grid | None:
     """Table of throws by target and plant, the paper's beside those of the own model."""
     header = (
         "target [m] | plant | made up for | throws | landed | landing error [m] | duration [s]"
@@ -106,9 +115,9 @@ PARTS = {
 
 def _row(result: Result) -> dict[str, str]:
     unit = result.unit
-    row = cells(result) | {"landed": landed(result, digits=0)}
+    row = cells(result) | {"landed": format_landed_share(result, digits=0)}
     if unit["plant"] == thrower.IDEAL:
-        row[MODEL] = of_paper("TO+MPC", unit["target"])
+        row[MODEL] = format_paper_result("TO+MPC", unit["target"])
     else:
         row["made up for"] = thrower.MADE_UP[unit["compensation"]]
     if result.good.any():
@@ -215,11 +224,13 @@ def _panel(
     """
     title = SHORT[plant]
     ideal = plant == thrower.IDEAL
-    shipped = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
+    shipped = [(name, thrown.shipped_throws(name, policies_on, FRONT_TARGET)) for name in names]
     policies = [(name, result) for name, result in shipped if result and result.good.any()]
     fronts = []
     for i, (compensation, bounds) in enumerate(kinds):
-        selected = _swept(_find_baseline(thrown, plant, compensation=compensation, bounds=bounds))
+        selected = _select_sweep(
+            _find_baseline(thrown, plant, compensation=compensation, bounds=bounds)
+        )
         label = f"TO+MPC, bounds on {bounds}"
         late = ", release lag not made up for" if compensation == "delay" else ""
         entry = (i, label + late, points_of(selected))
@@ -239,9 +250,9 @@ def _panel(
     return charts.Trade(heading, tuple(fronts), tuple(stars), _paper_points() if ideal else ())
 
 
-def _swept(selected: Sequence[Result]) -> list[Result]:
+def _select_sweep(selected: Sequence[Result]) -> list[Result]:
     """Throws of the sweep: those by target are more."""
-    return [r for r in selected if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
+    return [r for r in selected if r.unit["throws"] <= FRONT_THROWS or not _has_defaults(r)]
 
 
 def points_of(selected: Sequence[Result]) -> ndarray:
@@ -346,7 +357,7 @@ def _count(points: Sequence) -> str:
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
     """Return the paper's table of settings, and ours of the own model."""
-    selected = _swept(_find_baseline(thrown, thrower.IDEAL))
+    selected = _select_sweep(_find_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None
     rows = []
@@ -361,7 +372,7 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
             names = ("landing error [m]", "duration [s]", "e_p [cm]", "e_v [cm/s]")
             rows.append((*head, *(row[name] for name in names)))
         else:
-            rows.append((*head, f"landed {landed(r, digits=0)}", "-", "-", "-"))
+            rows.append((*head, f"landed {format_landed_share(r, digits=0)}", "-", "-", "-"))
     header = "v [m/s] | w_t | rho | plan | landing error [m] | duration [s] | e_p [cm] | e_v [cm/s]"
     title = "Breakdown of the front in the own model; the paper's are of ten throws each"
     return Grid.from_rows(title, header, rows, heads=0)

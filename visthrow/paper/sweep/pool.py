@@ -104,7 +104,7 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
     be done are added to ``done``.
     """
 
-    def remaining(unit: ResultSource | ThrowUnit) -> bool:
+    def is_remaining(unit: ResultSource | ThrowUnit) -> bool:
         if unit.id not in done and unit.done(out):
             done.add(unit.id)
         return unit.id not in done
@@ -112,10 +112,10 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
     for source in work.sources:
         units = work.throws.get(source.id, ())
         in_training = [unit.id for unit in units if unit.params.plant == "hybrid"]
-        if source.config and remaining(source):
+        if source.config and is_remaining(source):
             yield Task(source.id, (source.id, *in_training), gpu=True)
             continue
-        units = [unit for unit in units if remaining(unit)]
+        units = [unit for unit in units if is_remaining(unit)]
         mine = [unit.id for unit in units if unit.id in in_training]
         if mine:
             yield Task(source.id, tuple(mine), gpu=True)

@@ -11,7 +11,7 @@ from typing import Any
 from visthrow.common.errors import StorageError
 from visthrow.paper import results
 from visthrow.paper.report.result_set import runs_of
-from visthrow.paper.sweep.work import PIECES, held, lock_of
+from visthrow.paper.sweep.work import PIECES, is_locked, lock_of
 from visthrow.paper.sweep.work_units import (
     PROGRESS,
     SUMMARY,
@@ -54,7 +54,7 @@ def _state(source: ResultSource, out: Path) -> tuple[str, float]:
         error = _final(source, out)["error_mean"]
         place = "" if error is None else f", {error:.3f} m at 2.0 m"
         return f"done in {seconds:.0f} s{place}", seconds
-    if held(lock_of(out, source.id)):
+    if is_locked(lock_of(out, source.id)):
         return f"running, {count}", seconds
     return f"stopped after {count}" if rows else "not begun", seconds
 

@@ -38,7 +38,7 @@ def lock_of(out: Path, name: str) -> Path:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[None]:
+def hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock on a file, which says who has it; BusyError where another process does.
 
     The kernel lets go of it with the process. The file stays: removing it would let two processes
@@ -57,7 +57,7 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def held(path: Path) -> bool:
+def is_locked(path: Path) -> bool:
     """Whether a living process has the lock on a file."""
     try:
         with path.open("r+") as file:
@@ -84,7 +84,7 @@ def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: f
         )
         unit = throws.get(name) or work.source(name)
         try:
-            with locked(lock_of(out, name)):
+            with hold_lock(lock_of(out, name)):
                 if unit.done(out):
                     continue
                 if isinstance(unit, ResultSource):

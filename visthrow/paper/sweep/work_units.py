@@ -121,15 +121,15 @@ class ThrowUnit:
         """
         source = self.source
 
-        def stated(name: str, changes: Changes) -> dict[str, Any]:
+        def state_config(name: str, changes: Changes) -> dict[str, Any]:
             if name:
                 values = config.to_dict(_experiment(name, changes))
             else:
                 values = _shipped_config(source.policy(out), changes)
             return {key: value for key, value in values.items() if key != "ppo"}
 
-        nominal = stated(source.config, source.flown)
-        return nominal, stated(*self.flight_config(nominal["task"]["observation"]["layout"]))
+        nominal = state_config(source.config, source.flown)
+        return nominal, state_config(*self.flight_config(nominal["task"]["observation"]["layout"]))
 
     def flight_config(self, layout: str) -> tuple[str, Changes]:
         """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its

@@ -173,7 +173,7 @@ class ThrowEnv(ThrowEpisodes):
         self.episode_length_buf += 1
         return action
 
-    def failed(self) -> Tensor:
+    def find_failures(self) -> Tensor:
         """Whether a negative end has come, bool, shape (E,)."""
         state = self.views.state
         return terminations.negative(
@@ -194,7 +194,7 @@ class ThrowEnv(ThrowEpisodes):
         p = self.cfg.task.reward
         time = self.episode_length_buf * period
         released = out["separated"] != 0
-        negative = ~released & self.failed()
+        negative = ~released & self.find_failures()
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         miss = out["landing_w"] - goal
         error = miss[:, :2].square().sum(-1).sqrt()

@@ -104,7 +104,9 @@ class FirstOrder(Algorithm):
         with torch.no_grad():
             self.surrogate = fit(self.flights)
             # random commands give every observation a spread to start from
-            self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
+            self.network.update_normalization(
+                {"actor": self.flights.obs[self.flights.mark_flown_steps()]}
+            )
             last = self.network.mlp[-1]
             last.weight.mul_(0.1)  # hover with the latch at rest, for any observation
             last.bias.copy_(env.start_action)
@@ -197,7 +199,7 @@ class FirstOrder(Algorithm):
         gain = (x.load_vel[1:] - x.load_vel[:-1]) / self.experiment.sim.control_period
         return -(rope * gain).sum(-1) / GRAVITY - rope[..., 2]
 
-    def _carrying(self, x: SimpleNamespace) -> Tensor:
+    def _reward_carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
         task = self.experiment.task
         env = self.env
@@ -251,7 +253,7 @@ class FirstOrder(Algorithm):
         excess = (x.action.abs() - 1.0).clamp(min=0.0)
         past = excess.square().sum(-1) * carried.detach()
         releasing = (chance * reward).sum(0)
-        carrying = (carried * self._carrying(x)).sum(0)
+        carrying = (carried * self._reward_carrying(x)).sum(0)
         gain = releasing + carrying - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
@@ -348,11 +350,13 @@ class FirstOrder(Algorithm):
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
         # a few wild flights must not outweigh the rest
         limit = OUTLIER * size.median()
-        self.layers.gradients(self.flights.flown()[:T], (limit / size).clamp(max=1.0))
+        self.layers.gradients(self.flights.mark_flown_steps()[:T], (limit / size).clamp(max=1.0))
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
-        self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
+        self.network.update_normalization(
+            {"actor": self.flights.obs[self.flights.mark_flown_steps()]}
+        )
         self.average.update_parameters(self.network)
         return {name: value.item() for name, value in figures.items()} | {
             "learning_rate": rate,

@@ -106,7 +106,7 @@ class FlightBatch:
         )
         self.mass = self._body + self._rope
 
-    def flown(self) -> Tensor:
+    def mark_flown_steps(self) -> Tensor:
         """Whether a flight was not over at a step, bool, shape (T, E)."""
         return torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps
 
@@ -137,7 +137,7 @@ class FlightBatch:
                 x[name][k] = source
             x["response"][k, :, 0] = self._thrust * state["motor_speed"].square().sum(-1)
             x["response"][k, :, 1:] = state["rate_b"]
-            self.failed[k] = env.failed()
+            self.failed[k] = env.find_failures()
             self.landing[k] = views.foreseen["landing_w"][:, :2]
             self.time[k] = views.foreseen["time_to_impact"]
             self.last = k

@@ -47,7 +47,7 @@ class Algorithm(ABC):
         return Policy.from_actor_state(state, self.experiment.ppo.activation, contract, made_by)
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy that :func:`visthrow.training.trainer.fitted` found to fit: its
+        """Start from a policy that :func:`visthrow.training.trainer.adopt_layers` found to fit: its
         weights, and its normaliser, which hardly moves from there.
         """
         for network in (self.network, self.average.module):

@@ -155,7 +155,7 @@ def average_weights(module: torch.nn.Module, window: int) -> AveragedModel:
     One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and
     Juditsky, SIAM J. Control and Optimization 30(4), 1992."""
 
-    def moved(mean: Tensor, current: Tensor, updates: Tensor) -> Tensor:
+    def move_mean(mean: Tensor, current: Tensor, updates: Tensor) -> Tensor:
         return mean + (current - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)
 
-    return AveragedModel(module, avg_fn=moved)
+    return AveragedModel(module, avg_fn=move_mean)
