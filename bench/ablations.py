@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from bench import start
-from bench.loop import PLANT, add_arguments, explained, named, recorded
+from bench.loop import PLANT, add_arguments, explain_logs, named_sizes, record_flight
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
@@ -87,7 +87,7 @@ class Ablations:
         strange = [name for name in self.names if name not in LACKS]
         if strange:
             raise DiagnoseError(f"no ablation {', '.join(strange)}; there are {', '.join(LACKS)}")
-        logs = self._flown(say)
+        logs = self._fly_throws(say)
         results = [
             self._one(name, logs, lambda line, name=name: say(f"{name}: {line}"))
             for name in self.names
@@ -101,7 +101,7 @@ class Ablations:
         write_json(self.folder / "record.json", record)
         return record
 
-    def _flown(self, say: Callable[[str], None]) -> list[Path]:
+    def _fly_throws(self, say: Callable[[str], None]) -> list[Path]:
         """Logs of throws at targets all around, by the policy as it was trained, on the plant that
         has everything.
 
@@ -120,7 +120,7 @@ class Ablations:
         for i, (path, log) in enumerate(
             zip(paths, throws(load_policy(self.policy), PLANT, goals, 0))
         ):
-            recording = recorded(log, np.random.default_rng(i))
+            recording = record_flight(log, np.random.default_rng(i))
             landing = {"landing": log["landing"]} if i >= self.flights else {}
             FlightLog({**recording.channels, **landing}, recording.meta).save(path)
         say(f"flown: {count}")
@@ -130,10 +130,10 @@ class Ablations:
         base = f"state_{name}"
         subfolder = self.folder / name
         subfolder.mkdir(parents=True, exist_ok=True)
-        verdict = explained(
+        verdict = explain_logs(
             logs[: self.flights], base, subfolder / "verdict.json", self.device, say
         )
-        theta = named(verdict)
+        theta = named_sizes(verdict)
         findings = verdict.get("findings", ())
         record = {
             "model": base,
@@ -150,7 +150,7 @@ class Ablations:
         kept = subfolder / "held.json"
         if not kept.exists():
             write_json(
-                kept, on_held_back(base, theta, LACKS[name], logs[self.flights :], self.device)
+                kept, measure_held_back(base, theta, LACKS[name], logs[self.flights :], self.device)
             )
             say("weighed on the throws that were held back")
         return record | {"held": json.loads(kept.read_text())}
@@ -198,12 +198,12 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     flight = Flight(plant, Policies([loaded], goals_w), recording, home)
     landed = 0
 
-    def over(flight: Flight) -> bool:
+    def is_over(flight: Flight) -> bool:
         nonlocal landed
         landed += not flight.open.any()
         return landed > round(AFTERWARDS / plant.period) or bool(flight.failed.any())
 
-    flight.run([hover(SETTLED), Phase(True, over)])
+    flight.run([hover(SETTLED), Phase(True, is_over)])
     if flight.failed.any():
         raise DiagnoseError(
             f"throws {np.flatnonzero(flight.failed)} did not come down"
@@ -217,7 +217,7 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     return [recorder.log() for recorder in recording.recorders]
 
 
-def on_held_back(
+def measure_held_back(
     base: str, theta: Mapping[str, float], lacks: str, logs: Sequence[Path], device: str
 ) -> dict[str, Any]:
     """Likelihood and landing errors of a verdict on held-out throws.

@@ -36,7 +36,7 @@ SEED = 12345
 STAGES = ("home", "before", "after")
 
 
-def adapted(
+def adapt(
     experiment: Experiment, policy: Policy, args: argparse.Namespace
 ) -> tuple[Policy, dict[str, float]]:
     """The policy after a full training, or one cut at ``--seconds``; its seconds without the
@@ -55,7 +55,9 @@ def adapted(
     }
 
 
-def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace) -> dict[str, Any]:
+def measure_errors(
+    folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
+) -> dict[str, Any]:
     """Errors of one alteration."""
     kept = folder / "errors.json"
     if kept.exists():
@@ -63,7 +65,7 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
     nominal = load_experiment("state", [ADAPTATION, *args.changes])
     shipped = Policy.load(find_policy("state"))
     altered = extended(nominal, hidden)
-    policy, figures = adapted(altered, shipped, args)
+    policy, figures = adapt(altered, shipped, args)
     errors = {"hidden": dict(hidden), **figures}
     for stage, experiment, thrower in zip(
         STAGES, (nominal, altered, altered), (shipped, shipped, policy), strict=True
@@ -87,7 +89,7 @@ def report(records_of: Sequence[Mapping[str, Any]], where: str) -> records.Repor
         cells = [statistics.mean(errors[stage]).text(1) for stage in STAGES]
         rows.append(
             (
-                loop.hidden_text(f),
+                loop.describe_hidden(f),
                 *cells,
                 f"{100 * won:.0f} %",
                 str(f["iterations"]),
@@ -132,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     for hidden in [record["hidden"] for record in loop.read()]:
         if not args.only or set(hidden) & set(args.only):
             alterations.append(
-                measured(
+                measure_errors(
                     Path(args.out) / "-".join(f"{n}_{v:g}" for n, v in hidden.items()), hidden, args
                 )
             )

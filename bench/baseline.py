@@ -19,16 +19,16 @@ from visthrow.task.measurement import TARGETS
 
 def full() -> list[dict[str, Any]]:
     """Units of the committed record ``baseline``: the cheap and informative ones first."""
-    made_up = [*_front(), *_on_reference("both", 20, front.SPEEDS[1::2])]
+    made_up = [*_list_front(), *_list_on_reference("both", 20, front.SPEEDS[1::2])]
     return [
-        *_by_target(50),
+        *_list_by_target(50),
         *made_up,
         *_late_front(),
-        *_on_reference("delay", 20, front.SPEEDS[1:2]),
+        *_list_on_reference("delay", 20, front.SPEEDS[1:2]),
     ]
 
 
-def _by_target(throws: int) -> Iterator[dict[str, Any]]:
+def _list_by_target(throws: int) -> Iterator[dict[str, Any]]:
     for target in TARGETS:
         yield from thrower.units(thrower.IDEAL, "none", target, throws)
     for compensation in reversed(thrower.MADE_UP):
@@ -42,7 +42,7 @@ def _settings(speeds: tuple[float, ...] = front.SPEEDS) -> Iterator[dict[str, fl
             yield {"speed": speed, "w_t": w_t, "rho": rho}
 
 
-def _front() -> Iterator[dict[str, Any]]:
+def _list_front() -> Iterator[dict[str, Any]]:
     """The sweep in the baseline's model and, with all delays compensated, in the training
     simulator.
     """
@@ -62,7 +62,7 @@ def _late_front() -> Iterator[dict[str, Any]]:
         yield from thrower.units("hybrid", "delay", FRONT_TARGET, FRONT_THROWS, **how)
 
 
-def _on_reference(
+def _list_on_reference(
     compensation: str, throws: int, speeds: tuple[float, ...]
 ) -> Iterator[dict[str, Any]]:
     """By target and a part of the sweep: a throw takes seconds there."""

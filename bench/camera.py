@@ -14,7 +14,7 @@ import torch
 from bench import start
 from bench.common_options import add_common
 from bench.report import Report, Table, device_name, finish, rate
-from bench.sim import on_one_core
+from bench.sim import pin_to_one_core
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import points_c_from_w
 from visthrow import config
@@ -122,7 +122,7 @@ def _settle(device: str) -> None:
         torch.cuda.synchronize(device)
 
 
-def graphed(function: Callable[[], Any], device: str) -> Callable[[], None]:
+def capture_graph(function: Callable[[], Any], device: str) -> Callable[[], None]:
     """The function from a CUDA graph, as training replays it."""
     with torch.cuda.device(device):
         function()
@@ -133,7 +133,7 @@ def graphed(function: Callable[[], Any], device: str) -> Callable[[], None]:
     return graph.replay
 
 
-def on_device(
+def time_on_device(
     params: Any, count: int, device: str, repeats: int, stretch: float = STRETCH
 ) -> dict[str, float]:
     """Seconds a call of each contender that runs on a device."""
@@ -142,11 +142,11 @@ def on_device(
     values = torch.tensor(row, device=device)[None, None]
     calls: dict[str, Callable[[], Any]] = {"keypoints": views.keypoints}
     if device.startswith("cuda"):
-        calls["keypoints, CUDA graph"] = graphed(views.keypoints, device)
+        calls["keypoints, CUDA graph"] = capture_graph(views.keypoints, device)
     calls["projection alone"] = lambda: ours(views.points_c, views.camera.fisheye)
     calls["kornia"] = lambda: kornia_projection(views.points_c, values)
     if device.startswith("cuda"):
-        calls["kornia, CUDA graph"] = graphed(calls["kornia"], device)
+        calls["kornia, CUDA graph"] = capture_graph(calls["kornia"], device)
     if device == "cpu":
         points = views.points_c.numpy()
         calls["OpenCV"] = lambda: opencv_projection(points, matrix, coefficients)
@@ -193,15 +193,15 @@ def measure(params: Any, count: int, device: str, repeats: int, stretch: float =
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
-        with on_one_core():
+        with pin_to_one_core():
             import cv2
 
             cv2.setNumThreads(1)
-            times = {"cpu": on_device(params, count, "cpu", repeats, stretch)}
+            times = {"cpu": time_on_device(params, count, "cpu", repeats, stretch)}
     finally:
         torch.set_num_threads(threads)
     if device != "cpu":
-        times[device] = on_device(params, count, device, repeats, stretch)
+        times[device] = time_on_device(params, count, device, repeats, stretch)
     exact = accuracy(params, min(count, 4096))
     header = ("what", "time", "points/s", "time over our keypoints")
     tables = []

@@ -15,7 +15,7 @@ from visthrow.logs.samples import Samples
 KINDS = ("slow", "fast", "noisy", "crash")
 
 
-def drawn(seed: int, kind: str, together: bool = False) -> tuple[np.ndarray, ...]:
+def draw_motion(seed: int, kind: str, together: bool = False) -> tuple[np.ndarray, ...]:
     """Draw a motion and the velocity that a log holds of it.
 
     Returns times [s], positions [m], velocities [m/s], and how late the velocity is [s]; noise is
@@ -51,7 +51,7 @@ def drawn(seed: int, kind: str, together: bool = False) -> tuple[np.ndarray, ...
 
 def measure(seed: int, kind: str, together: bool = False) -> tuple[float, float]:
     """Return the error of a delay and its stated deviation [s]."""
-    time, pos, vel, late = drawn(seed, kind, together)
+    time, pos, vel, late = draw_motion(seed, kind, together)
     relation = relate(Samples(time, pos).derivative(), Samples(time, vel))
     assert relation is not None
     return relation.delay - float(late), relation.delay_sd

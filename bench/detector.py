@@ -95,12 +95,12 @@ def run(args: argparse.Namespace) -> None:
         if level == OTHER_LENS:
             camera = replace(camera, fisheye=replace(camera.fisheye, **BENT))
             detectors = detectors_of(camera)
-        table[level], pictures = counted(
+        table[level], pictures = count_detections(
             camera, renderer, detectors, nuisances, args.frames, args.seed, args.known
         )
         rows.append(pictures)
         _print(level, table[level], first=len(rows) == 1)
-    table["neither"] = mistaken(detectors)
+    table["neither"] = find_mistakes(detectors)
     print(
         f"of {table['neither']['looks']} looks at photographs with neither: "
         + ", ".join(
@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> None:
         write_json(args.json, table)
 
 
-def mistaken(detectors: dict) -> dict[str, Any]:
+def find_mistakes(detectors: dict) -> dict[str, Any]:
     """Balls and squares that detectors report in photographs that show neither, nine crops of each;
     without any prior input.
     """
@@ -177,7 +177,7 @@ def figures_of(
     return figures | {"seconds": float(np.median(spent)), "overconfidence": ratio}
 
 
-def known_of(prior: str, truth, height: float, e: int, rng: np.random.Generator):
+def prior_of(prior: str, truth, height: float, e: int, rng: np.random.Generator):
     """Return a detector's prior knowledge of scene e; see :data:`PRIORS`."""
 
     rot_wc = truth.rot_wc[e].numpy()
@@ -193,7 +193,7 @@ def known_of(prior: str, truth, height: float, e: int, rng: np.random.Generator)
     )
 
 
-def counted(
+def count_detections(
     camera,
     renderer,
     detectors: dict,
@@ -224,7 +224,7 @@ def counted(
         true = np.concatenate([corners.numpy(), lens.denormalize(box).numpy()], 1)
         for e, image in enumerate(images[..., ::-1]):
             rot_wc = truth.rot_wc[e].numpy()
-            knows = known_of(
+            knows = prior_of(
                 prior, truth, float(scenes.pose[e, 2]), e, np.random.default_rng([number, e])
             )
             for name, detector in detectors.items():

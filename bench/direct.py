@@ -146,7 +146,7 @@ class Direct:
         return out.command[0].astype(float), bool(out.release[0])
 
 
-def scored(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
+def score_landing(report: dict[str, Any], params: HilParams, start: float | None) -> dict[str, Any]:
     """Return the error [m] and duration [s] of a plant's true landing; both None where there is
     none.
     """
@@ -166,7 +166,7 @@ def run(args: argparse.Namespace) -> None:
         flown = load_plant(args.plant, args.policy or params.policy, seed)
         report = Direct(flown, policy, params, FakeMocapParams(), seed).throw()
         print(
-            json.dumps({"seed": seed, **scored(report, params, report["start"]), **report}),
+            json.dumps({"seed": seed, **score_landing(report, params, report["start"]), **report}),
             flush=True,
         )
 

@@ -149,7 +149,7 @@ HOVERS = ("states.armed_least=9.0",)
 """Armed it hovers, until its time for that is over."""
 
 
-def _ending(text: str, number: int, run: tuple[str, ...] = ()) -> Case:
+def _make_ending(text: str, number: int, run: tuple[str, ...] = ()) -> Case:
     return Case(text, RUNNER, run=run, act=_signal(number), since="act", ends=True)
 
 
@@ -197,9 +197,9 @@ CASES = {
     "late": Case("a tick is 0.15 s late", RUNNER, act=_pause(0.15), since="act"),
     "very-late": Case("a tick is 0.8 s late", RUNNER, act=_pause(0.8), since="act"),
     "disk-full": Case("the disk is full", RUNNER, act=_fill_disk, since="act"),
-    **{name: _ending(text, number) for name, (text, number) in ENDS.items()},
+    **{name: _make_ending(text, number) for name, (text, number) in ENDS.items()},
     **{
-        f"{name}-in-hover": _ending(f"{text}, in hover", number, HOVERS)
+        f"{name}-in-hover": _make_ending(f"{text}, in hover", number, HOVERS)
         for name, (text, number) in ENDS.items()
     },
     "ctrl-c-twice": Case("Ctrl-C twice", RUNNER, act=_twice, since="act", ends=True),
@@ -207,7 +207,7 @@ CASES = {
 }
 
 
-def known_cases() -> dict[str, Case]:
+def list_cases() -> dict[str, Case]:
     """Return the faults by name."""
     return {**{name: _mocap(name, text) for name, (text, _) in FAULTS.items()}, **CASES}
 
@@ -279,7 +279,7 @@ def faults(args: argparse.Namespace) -> Report:
         raise VisthrowError(
             f"--jobs {args.jobs}, --speed {args.speed}; expected 1 or more, and 0.05 to 1"
         )
-    cases = known_cases()
+    cases = list_cases()
     for name in args.faults:
         if name not in cases:
             raise VisthrowError(f"fault '{name}'; {suggest(name, cases)}")
@@ -305,7 +305,7 @@ def faults(args: argparse.Namespace) -> Report:
                 f"--kind {args.kind} with {', '.join(odd)}; expected {', '.join(sorted(flown))}"
             )
         names = [name for name in cases if name in (args.faults or flown)]
-        done = dict(_announced(side_by_side(inject, names, assign_cores(args.jobs))))
+        done = dict(_announce(side_by_side(inject, names, assign_cores(args.jobs))))
         for name in names:
             case = cases[name]
             result = done[name]
@@ -351,7 +351,7 @@ def faults(args: argparse.Namespace) -> Report:
     return Report("hil", "What the runner does when something fails", tables, notes, figures)
 
 
-def _announced(
+def _announce(
     results: Iterator[tuple[str, dict[str, Any]]],
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, values in results:

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         for label, group in groups.items():
             status(f"{name} on {label}")
             vehicles = [str(k) for k in range(args.vehicles)] if label == DRAWN else [label]
-            rows += _thrown(
+            rows += _throw_fleet(
                 name,
                 policy,
                 group,
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         _write(folder, rows, {})
     for k, (rival, experiment) in rivals.items():
         status(f"specialised policy on {_label(k)}")
-        rows += _thrown(SPECIALIST, rival, experiment, [_label(k)], THROWS, device, args.seed)
+        rows += _throw_fleet(SPECIALIST, rival, experiment, [_label(k)], THROWS, device, args.seed)
     status("")
     seconds = {k: rival.made_by["seconds"] for k, (rival, _) in rivals.items()}
     return finish(_write(folder, rows, seconds), args)
@@ -112,10 +112,10 @@ def _one(experiment: Any, vehicle: str) -> Any:
     """Experiment of one vehicle, by its name or the number of its draw."""
     if vehicle.isdigit():
         return replace(experiment, fleet=replace(experiment.fleet, count=1, first=int(vehicle)))
-    return _named(experiment, vehicle)
+    return _load_vehicle(experiment, vehicle)
 
 
-def _named(experiment: Any, name: str) -> Any:
+def _load_vehicle(experiment: Any, name: str) -> Any:
     """Experiment of one named vehicle and its rope, which are in SI units."""
     from sim.params import RopeParams, VehicleParams
     from visthrow import config
@@ -126,7 +126,7 @@ def _named(experiment: Any, name: str) -> Any:
     return replace(experiment, vehicle=vehicle, rope=rope, fleet=fleet)
 
 
-def _thrown(
+def _throw_fleet(
     name: str,
     policy: Any,
     experiment: Any,
@@ -185,7 +185,7 @@ def _rivals(
         if path.exists() or start - begin + longest > 60.0 * args.minutes:
             continue
         status(f"training for {_label(vehicle)}, of {len(vehicles)}")
-        _trained(_one(base, vehicle), device).save(path)
+        _train(_one(base, vehicle), device).save(path)
         longest = max(longest, time.monotonic() - start)
     paths = {vehicle: folder / f"{vehicle}.npz" for vehicle in vehicles}
     return {
@@ -195,7 +195,7 @@ def _rivals(
     }
 
 
-def _trained(experiment: Any, device: str) -> Any:
+def _train(experiment: Any, device: str) -> Any:
     """Policy trained for an experiment, with its seconds in the provenance."""
     from visthrow.common import provenance
     from visthrow.task import contract_of

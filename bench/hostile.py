@@ -27,7 +27,7 @@ from hil.poses.sources.motion_capture import (
     RigidBody,
 )
 from hil.poses.sources.ros2 import KINDS, Ros2Source
-from tests.fuzz import mutated, noise
+from tests.fuzz import mutate, noise
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
@@ -99,7 +99,7 @@ class NatNet:
             payload = struct.pack("<4I", 0, *rng.integers(1 << 20, 1 << 31, 3)) + rng.bytes(40)
             self.source.take(message(FRAME, payload), HOST)
         elif kind == 3:
-            self.source.take(mutated(rng, good), STRANGER)
+            self.source.take(mutate(rng, good), STRANGER)
         else:  # well formed, from another port of the host's
             self.source.take(
                 good[rng.integers(len(good))], (HOST[0], int(rng.integers(2000, 3000)))
@@ -239,7 +239,7 @@ class Ros2:
 READERS = {reader.kind: reader for reader in (NatNet, MotionCapture, Ros2)}
 
 
-def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
+def fly_beside_hostile(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
     """Fly a throw beside hostile items: the decisions, the fake, the reader, and the number of
     items.
 
@@ -257,7 +257,7 @@ def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
     poll = source.poll
     tick = runner.tick
 
-    def polled(now: float) -> list[Pose]:
+    def poll_hostile(now: float) -> list[Pose]:
         flying = runner.machine.state in (State.THROW, State.RECOVER)
         reader.source.hold(flying)
         poses = poll(now)
@@ -271,12 +271,12 @@ def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
         sent[0] += attacks
         return reader.source.poll(now)
 
-    def ticked(now: float, *args: Any) -> Any:
+    def tick_hostile(now: float, *args: Any) -> Any:
         decisions.append(tick(now, *args))
         return decisions[-1]
 
-    source.poll = polled
-    runner.tick = ticked
+    source.poll = poll_hostile
+    runner.tick = tick_hostile
     cut(runner, source, clock, AutoOperator(), None, 8.0, lambda decision: None)
     counted = reader.source.roster.refused
     counted += sum(track.gate.refused.get("finite", 0) for track in runner.tracks.values())
@@ -288,12 +288,14 @@ def judge(kind: str, seed: int, count: int) -> int:
 
     Raises AssertionError: a decision changed, or an item was not counted.
     """
-    alone, plain, none, _ = flown(kind, seed, 0)
+    alone, plain, none, _ = fly_beside_hostile(kind, seed, 0)
     assert plain.witness.releases == 1, "it throws"
     assert none == 0
     total = 0
     while total < count:
-        decisions, fake, counted, sent = flown(kind, seed + 1000 * total, count - total)
+        decisions, fake, counted, sent = fly_beside_hostile(
+            kind, seed + 1000 * total, count - total
+        )
         assert sent, "a throw in which no item arrived proves nothing"
         assert decisions == alone, f"{kind}, seed {seed}: a decision changed"
         assert fake.events == plain.events

@@ -60,7 +60,7 @@ def in_training(
         )
 
 
-def on_reference(
+def measure_on_reference(
     flown: Experiment, name: str, count: int, seed: int
 ) -> tuple[list, np.ndarray, np.ndarray]:
     """The same on a reference plant."""
@@ -136,7 +136,7 @@ def main() -> None:
     if args.plant == "hybrid":
         calibrations, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
-        calibrations, turn, scale = on_reference(flown, args.plant, args.count, args.seed)
+        calibrations, turn, scale = measure_on_reference(flown, args.plant, args.count, args.seed)
         tilt_limit = 0.5 * TILT_DEG
     known = [i for i, one in enumerate(calibrations) if one is not None]
     off = np.degrees([np.array(calibrations[i].turn_b) - turn[i] for i in known])

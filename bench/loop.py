@@ -127,30 +127,30 @@ class Loop:
         def report(line: str) -> None:
             say(f"{time.perf_counter() - begin:4.0f} s: {line}")
 
-        def timed(name: str, stage: Callable[..., Any], *args: Any) -> Any:
+        def time_stage(name: str, stage: Callable[..., Any], *args: Any) -> Any:
             start = time.perf_counter()
             result = stage(*args, report)
             seconds[name] = round(time.perf_counter() - start, 1)
             return result
 
         def oracle() -> dict[str, Any]:
-            timed("training of the oracle", self._train, "oracle")
-            return timed(
+            time_stage("training of the oracle", self._train, "oracle")
+            return time_stage(
                 "throws of the oracle", self._throws, "oracle", str(self.folder / "oracle" / POLICY)
             )
 
         with concurrent.futures.ThreadPoolExecutor(3) as stages:
             knowing = stages.submit(oracle)
-            logs = timed("flights", self._flights, truth)
-            blind = stages.submit(timed, "throws before", self._throws, "before", self.policy)
-            verdict = timed("diagnosis", self._diagnose, logs)
-            theta = named(verdict)
+            logs = time_stage("flights", self._flights, truth)
+            blind = stages.submit(time_stage, "throws before", self._throws, "before", self.policy)
+            verdict = time_stage("diagnosis", self._diagnose, logs)
+            theta = named_sizes(verdict)
             report(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
             throws = dict.fromkeys(WHO)
             if theta:
                 self._config("extended", extended(nominal, theta))
-                timed("training", self._train, "extended")
-                throws["after"] = timed(
+                time_stage("training", self._train, "extended")
+                throws["after"] = time_stage(
                     "throws after", self._throws, "after", str(self.folder / "extended" / POLICY)
                 )
             throws |= {"before": blind.result(), "oracle": knowing.result()}
@@ -167,7 +167,7 @@ class Loop:
             "throws": throws,
             "seconds": seconds,
         }
-        record["recovered"] = recovered(throws)
+        record["recovered"] = estimate_recovered_share(throws)
         write_json(self.folder / RECORD, record)
         return record
 
@@ -219,7 +219,7 @@ class Loop:
         )
 
     def _diagnose(self, logs: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
-        return explained(logs, self.base, self.folder / "verdict.json", self.diagnose_on, say)
+        return explain_logs(logs, self.base, self.folder / "verdict.json", self.diagnose_on, say)
 
     def _throws(self, name: str, policy: str, say: Callable[[str], None]) -> dict[str, Any]:
         path = self.folder / f"throws_{name}.json"
@@ -233,7 +233,7 @@ class Loop:
             kept = {name: np.round(values, DIGITS).tolist() for name, values in kept.items()}
             write_json(path, kept | {"success": np.asarray(result.success, dtype=bool).tolist()})
         throws = json.loads(path.read_text())
-        error = landed(throws)
+        error = landing_errors(throws)
         say(
             f"thrown: {name}, {len(error)} landed"
             + (f", {np.mean(error):.3f} m" if len(error) else "")
@@ -267,19 +267,21 @@ def read(places: Sequence[Path] = ()) -> list[dict[str, Any]]:
     return [json.loads(file.read_text()) for file in files]
 
 
-def landed(throws: Mapping[str, Any]) -> np.ndarray:
+def landing_errors(throws: Mapping[str, Any]) -> np.ndarray:
     """Landing errors of the throws that came down [m]."""
     return np.array(throws["error"], dtype=float)[np.array(throws["success"], dtype=bool)]
 
 
-def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> dict[str, float]:
+def estimate_recovered_share(
+    throws: Mapping[str, Any], draws: int = 4000, seed: int = 0
+) -> dict[str, float]:
     """Share of the landing error that the hidden effect costs which the diagnosis wins back, with
     its 95 % interval.
 
     ``(before - after) / (before - oracle)`` of the mean errors; bootstrap over throws, each policy
     by itself."""
     rng = np.random.default_rng(seed)
-    errors = {name: landed(throws[name]) for name in WHO}
+    errors = {name: landing_errors(throws[name]) for name in WHO}
     if any(len(e) < 2 for e in errors.values()):
         return {"share": float("nan"), "low": float("nan"), "high": float("nan")}
 
@@ -296,7 +298,7 @@ def recovered(throws: Mapping[str, Any], draws: int = 4000, seed: int = 0) -> di
     }
 
 
-def named(verdict: Mapping[str, Any]) -> dict[str, float]:
+def named_sizes(verdict: Mapping[str, Any]) -> dict[str, float]:
     """Sizes that a verdict sets in the model."""
     return {name: float(value) for name, value in verdict.get("theta", {}).items()}
 
@@ -321,7 +323,7 @@ def fly_all(
     return paths
 
 
-def explained(
+def explain_logs(
     logs: Sequence[Path], plant: str, answer: Path, device: str, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """Verdict of ``visthrow diagnose explain`` on logs, run in a separate process and written to
@@ -350,20 +352,22 @@ def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> Non
     angle = rng.uniform(-np.pi, np.pi)
     distance = rng.uniform(1.0, 1.9)
     goal = np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
-    recorded(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(path)
+    record_flight(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(
+        path
+    )
 
 
-def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
+def record_flight(log: FlightLog, rng: np.random.Generator) -> FlightLog:
     """A simulated flight as motion capture and the radio's log record it: noisy poses, commands,
     the battery's voltage, no true states.
     """
     start = log.meta["times"]["policy_start"] - BEFORE
     end = log.meta["times"].get("landing", log.meta["times"]["end"])
     channels = {
-        name: _between(log[name], start, end + AFTER)
+        name: _cut(log[name], start, end + AFTER)
         for name in ("command", "release_command", "battery_voltage", "pos_w", "quat_wb")
     }
-    channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
+    channels["payload_pos_w"] = _cut(log["payload_pos_w"], start, end)
     measured = mocap.add_mocap_noise(
         {name: channels[name].values for name in ("pos_w", "payload_pos_w", "quat_wb")}, NOISE, rng
     )
@@ -374,12 +378,12 @@ def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
     return FlightLog(channels, {"policy": log.meta["policy"], "plant": log.meta["plant"]})
 
 
-def _between(channel: Channel, start: float, end: float) -> Channel:
+def _cut(channel: Channel, start: float, end: float) -> Channel:
     keep = (channel.time >= start) & (channel.time <= end)
     return channel.only(keep)
 
 
-def hidden_text(record: Mapping[str, Any]) -> str:
+def describe_hidden(record: Mapping[str, Any]) -> str:
     """The hidden effects and the model, as text for tables."""
     base = record.get("base", "state")
     return ", ".join(f"{n} {v:+.4g}" for n, v in record["hidden"].items()) + (
@@ -395,7 +399,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
     ]
     for r in records:
         names = ", ".join(f"{n} {v:+.4g}" for n, v in r["named"].items()) or "nothing"
-        errors = {name: landed(throws) for name, throws in r["throws"].items()}
+        errors = {name: landing_errors(throws) for name, throws in r["throws"].items()}
         cells = []
         for name in WHO:
             count = f" ({len(errors[name])} of {len(r['throws'][name]['error'])} landed)"
@@ -414,7 +418,7 @@ def table(records: Sequence[Mapping[str, Any]]) -> str:
                 f"{100 * share['share']:.0f} % [{100 * share['low']:.0f},"
                 f" {100 * share['high']:.0f}]"
             )
-        lines.append(f"| {hidden_text(r)} | {names} | {' | '.join(cells)} | {won} |")
+        lines.append(f"| {describe_hidden(r)} | {names} | {' | '.join(cells)} | {won} |")
     return "\n".join(lines)
 
 
@@ -423,10 +427,14 @@ def picture(records: Sequence[Mapping[str, Any]]) -> bytes:
     from visthrow.paper.report.charts import Mark, marks
 
     rows = [
-        Mark(hidden_text(r), statistics.mean(1e3 * landed(r["throws"][name])), WHO.index(name))
+        Mark(
+            describe_hidden(r),
+            statistics.mean(1e3 * landing_errors(r["throws"][name])),
+            WHO.index(name),
+        )
         for r in records
         for name in WHO
-        if len(landed(r["throws"][name]))
+        if len(landing_errors(r["throws"][name]))
     ]
     return marks(rows, "landing error on the plant [mm]", WHO, log=True)
 

@@ -9,7 +9,7 @@ import numpy as np
 from bench import start
 from bench.common_options import add_common
 from bench.report import Report, Table, finish
-from bench.sim import on_one_core
+from bench.sim import pin_to_one_core
 from visthrow.common.errors import VisthrowError
 
 TARGETS = (1.5, 2.0, 2.5)
@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.task import load_experiment
 
     experiment = load_experiment(args.config, args.overrides)
-    with on_one_core(args.core) as core:
+    with pin_to_one_core(args.core) as core:
         report = measure(experiment, args.throws, core)
     return finish(report, args)
 

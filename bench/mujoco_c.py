@@ -30,7 +30,7 @@ class BenchScene:
     advance: Callable[[int], None]  # so many steps; starts the scene anew whenever it has ended
 
 
-def started(
+def start_scene(
     scene: Scene, step: float, integrator: str, armature: float
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """MuJoCo's model and data at the start of a scene, whose first wrench acts throughout.
@@ -49,11 +49,11 @@ def started(
     return model, data
 
 
-def timed_scene(
+def time_scene(
     scene: Scene, name: str, step: float, integrator: str = "RK4", armature: float = 0.0
 ) -> BenchScene:
-    """A rope that runs in C; arguments as of :func:`started`."""
-    model, data = started(scene, step, integrator, armature)
+    """A rope that runs in C; arguments as of :func:`start_scene`."""
+    model, data = start_scene(scene, step, integrator, armature)
     start = data.qpos.copy(), data.qvel.copy()
     length = round(scene.duration / step)
     done = 0

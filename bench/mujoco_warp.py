@@ -24,7 +24,7 @@ MISSING = (
 def _model() -> tuple[Any, Any]:
     from bench import mujoco_c
 
-    return mujoco_c.started(
+    return mujoco_c.start_scene(
         mujoco_c.HARD_THROW, mujoco_c.IMPLICIT_STEP, "implicitfast", mujoco_c.ARMATURE
     )
 
@@ -63,7 +63,7 @@ class Worlds:
         wp.synchronize_device(self.device)
         return self.count * SUBSTEPS * replays / (time.perf_counter() - start)
 
-    def off_from_c(self, replays: int) -> float:
+    def measure_difference(self, replays: int) -> float:
         """Distance [m] of world 0's vehicle from MuJoCo C's after as many steps: the same model was
         measured.
         """
@@ -94,7 +94,7 @@ def measure(
     off = float("nan")
     for count in batches:
         worlds = Worlds(count, device)
-        off = worlds.off_from_c(min(stretch, 5))
+        off = worlds.measure_difference(min(stretch, 5))
         rates = [worlds.rate(stretch) for _ in range(repeats)]
         best = statistics.median(rates)
         rows.append(

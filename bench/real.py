@@ -95,7 +95,7 @@ class Case:
     of: str = ""  # of a part: the vehicle
 
 
-def changed(
+def change_channels(
     names: Sequence[str], change: Callable[[np.ndarray], np.ndarray]
 ) -> Callable[[Logs], Logs]:
     """Return a change of some channels' values in all logs."""
@@ -169,17 +169,17 @@ def another_thrust(logs: Logs) -> Logs:
     ]
 
 
-def uneven_thrust(logs: Logs) -> Logs:
+def scale_thrust_unevenly(logs: Logs) -> Logs:
     """Thrust in another scale in each flight."""
     return [
-        changed(["thrust_command"], lambda v, f=f: f * v)([log])[0]
+        change_channels(["thrust_command"], lambda v, f=f: f * v)([log])[0]
         for log, f in zip(logs, (0.75, 1.0, 1.3))
     ]
 
 
 def dead_rotor(logs: Logs) -> Logs:
     """The rear left motor's channel reads half."""
-    return changed(["motor_command"], lambda v: v * [1.0, 1.0, 0.5, 1.0])(logs)
+    return change_channels(["motor_command"], lambda v: v * [1.0, 1.0, 0.5, 1.0])(logs)
 
 
 def winds(_: Logs) -> Logs:
@@ -189,7 +189,7 @@ def winds(_: Logs) -> Logs:
     return [fly(8.0, drag=0.03, wind=wind, seed=i) for i, wind in enumerate((-2.0, 0.5, 3.0) * 2)]
 
 
-def spinning(_: Logs) -> Logs:
+def throw_spinning_balls(_: Logs) -> Logs:
     """Sixty throws of a ball with drag and much spin."""
     from bench.diagnose.flown import ball_log
 
@@ -314,23 +314,25 @@ SETS = (
 )
 
 
-def _spoilt(name: str, change: Callable[[Logs], Logs], expect: str) -> Case:
+def _spoil(name: str, change: Callable[[Logs], Logs], expect: str) -> Case:
     """Three flights of a Crazyflie, changed."""
     return Case(f"trap {name}", "cf_payload", CF3, change, expect=expect)
 
 
 LATER = r"clocks apart|stream of the thrust|ms (late|early|behind)"
 TRAPS = (
-    _spoilt(
+    _spoil(
         "x and y of positions exchanged",
-        changed(PATHS, lambda v: v[:, [1, 0, 2]]),
+        change_channels(PATHS, lambda v: v[:, [1, 0, 2]]),
         r"\(y,x,z\) of positions",
     ),
-    _spoilt("y mirrored", changed(PATHS, lambda v: v * [1, -1, 1]), r"\(x,-y,z\) of positions"),
+    _spoil(
+        "y mirrored", change_channels(PATHS, lambda v: v * [1, -1, 1]), r"\(x,-y,z\) of positions"
+    ),
     Case("trap attitude, IMU and thrust late", "cf_payload", CF3, late(AIRBORNE), expect=LATER),
     Case("trap payload late", "cf_payload", CF3, late(["payload_pos_w"]), expect=LATER),
-    _spoilt("one of three logs late", first(late(AIRBORNE)), rf"left out: log204.*({LATER})"),
-    _spoilt(
+    _spoil("one of three logs late", first(late(AIRBORNE)), rf"left out: log204.*({LATER})"),
+    _spoil(
         "thrust of another flight", another_thrust, r"thrust of another flight|stream of the thrust"
     ),
     Case(
@@ -339,20 +341,20 @@ TRAPS = (
         (*CF3, CF3[0]),
         expect=r"a copy of another log, which counts once",
     ),
-    _spoilt(
+    _spoil(
         "thrust in grams",
-        changed(["thrust_command"], lambda v: v / 9.80665e-3),
+        change_channels(["thrust_command"], lambda v: v / 9.80665e-3),
         r"in g of thrust|another unit",
     ),
-    _spoilt("rates in degrees", changed(["rate_b"], np.degrees), r"one is in degrees"),
-    _spoilt(
+    _spoil("rates in degrees", change_channels(["rate_b"], np.degrees), r"one is in degrees"),
+    _spoil(
         "positions in millimetres",
-        changed(PATHS, lambda v: 1e3 * v),
+        change_channels(PATHS, lambda v: 1e3 * v),
         r"millimetres taken for metres",
     ),
-    _spoilt(
+    _spoil(
         "thrust's scale differs by flight",
-        uneven_thrust,
+        scale_thrust_unevenly,
         r"VARIES[^\n]*(thrust|mass)|differs from flight to flight",
     ),
     Case(
@@ -375,7 +377,7 @@ TRAPS = (
         "trap sixty spinning balls",
         BALL,
         (),
-        spinning,
+        throw_spinning_balls,
         expect=r"(?s)FOUND[^\n]*(spin|drag).*60 windows of 60 flights",
     ),
 )
@@ -444,7 +446,7 @@ PARTS = (
 )
 
 
-def _opened(text: str, folder: Path) -> tuple[str, Callable[[Logs], NumericModel]]:
+def _open_setup(text: str, folder: Path) -> tuple[str, Callable[[Logs], NumericModel]]:
     """Return the setup that reads a case's logs, and what makes its model of them."""
     if text in EXAMPLES:
         return EXAMPLES[text]
@@ -472,7 +474,7 @@ def run(task: tuple[Case, Path]) -> dict:
     case, data = task
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     with tempfile.TemporaryDirectory() as folder:
-        name, model_of = _opened(case.setup, Path(folder))
+        name, model_of = _open_setup(case.setup, Path(folder))
         known = setups.known(name)
         logs = case.change(_read(case.files, data, name))
         try:
@@ -511,11 +513,11 @@ def run(task: tuple[Case, Path]) -> dict:
             row["ok"] = bool(re.search(case.expect, text))
         if case.test and diagnosis.theta:
             unseen = case.of_test(_read(case.test, data, name))
-            row["unseen"] = _unseen(diagnosis, model_of(unseen), model_of(unseen))
+            row["unseen"] = _measure_unseen(diagnosis, model_of(unseen), model_of(unseen))
         return row | {"cpu_s": resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun}
 
 
-def _unseen(
+def _measure_unseen(
     diagnosis: result.Diagnosis, plain: NumericModel, extended: NumericModel
 ) -> dict[str, list[float]]:
     """Return errors on held-out flights of the plain model and of one with the sizes that `apply`

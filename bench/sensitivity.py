@@ -22,7 +22,7 @@ import torch
 
 from bench import start
 from bench.report import Report, Table, finish
-from bench.world_held import held_in_world
+from bench.world_held import register_world_held
 from sim.effects.setting import Setting, generalise, specialise
 from visthrow.common.arguments import add_option
 from visthrow.common.workers import status
@@ -57,7 +57,7 @@ LAST = 64.0
 Point = dict[str, Any]
 
 
-def changed(experiment: Experiment, name: str, theta: float) -> Experiment:
+def apply_effect(experiment: Experiment, name: str, theta: float) -> Experiment:
     """Return the experiment with an effect of this size on its plant or camera."""
     plant = plant_of(experiment)
     base = generalise(Setting(plant, experiment.sensing, camera=experiment.camera))
@@ -70,7 +70,7 @@ def changed(experiment: Experiment, name: str, theta: float) -> Experiment:
     )
 
 
-def thrown(experiment: Experiment, policy: Any) -> dict[str, float]:
+def measure_throws(experiment: Experiment, policy: Any) -> dict[str, float]:
     """Throws in one plant: mean error, deviation, and share that landed."""
     throws = protocol.throw(experiment, policy.actor(THROWS), TARGET, THROWS, "cpu", SEED)
     error = throws.error[throws.success]
@@ -94,7 +94,7 @@ def sizes(name: str, experiment: Experiment) -> Iterator[tuple[int, list[float]]
             yield sign, [*within, *([sign * most] if len(within) < count else [])]
 
 
-def crossing(points: Sequence[tuple[float, float]]) -> float | None:
+def find_crossing(points: Sequence[tuple[float, float]]) -> float | None:
     """Size at which the error first reaches :data:`MISS`, by straight lines; None where it does
     not.
     """
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
         loaded = load_policy(name)
         figures[name] = {
             "sweeps": _sweeps(name, points),
-            "wrench": {axes: _held(name, axes, points) for axes in AXES},
+            "wrench": {axes: _measure_held(name, axes, points) for axes in AXES},
             "effects": _effects(name, loaded.experiment, loaded.policy, points),
         }
     status("")
@@ -151,20 +151,20 @@ def _sweeps(name: str, points: Points) -> dict[str, list[tuple[float, float]]]:
 
             def throw(key: str = key, value: float = value) -> dict[str, float]:
                 loaded = load_policy(name, None, [f"{key}={value}"], allow=["rope"])
-                return thrown(loaded.experiment, loaded.policy)
+                return measure_throws(loaded.experiment, loaded.policy)
 
             rows.append((value, points.get((name, key, value), throw)["error"]))
         sweeps[key] = rows
     return sweeps
 
 
-def _held(name: str, axes: str, points: Points) -> float:
+def _measure_held(name: str, axes: str, points: Points) -> float:
     """Landing error with the wrench held in these axes."""
 
     def throw() -> dict[str, float]:
         loaded = load_policy(name, None, ["sim.solver=exchanged_chain"])
-        with held_in_world() if axes == "world" else contextlib.nullcontext():
-            return thrown(loaded.experiment, loaded.policy)
+        with register_world_held() if axes == "world" else contextlib.nullcontext():
+            return measure_throws(loaded.experiment, loaded.policy)
 
     return points.get((name, f"wrench held in {axes}", 0.0), throw)["error"]
 
@@ -183,13 +183,13 @@ def _effects(
             for size in steps:
 
                 def throw(effect: str = effect_name, size: float = size) -> dict[str, float]:
-                    return thrown(changed(experiment, effect, size), policy)
+                    return measure_throws(apply_effect(experiment, effect, size), policy)
 
                 point = points.get((name, effect_name, size), throw)
                 rows.append((size, point["error"] if point["landed"] >= 0.5 else math.inf))
                 if rows[-1][1] >= MISS:
                     break
-            signs["+" if sign > 0 else "-"] = {"size": crossing(rows), "points": rows}
+            signs["+" if sign > 0 else "-"] = {"size": find_crossing(rows), "points": rows}
         if signs:
             unit = {"unit": effect.unit, "prior_sd": effect.prior_sd, "cause": effect.cause}
             effects[effect_name] = {**unit, **signs}

@@ -20,7 +20,7 @@ from bench.common_options import add_common
 from bench.report import Report, Table, finish
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
-from tests.oracle.converged import converged
+from tests.oracle.converged import run_converged
 from tests.simulators import fly
 from visthrow.common.errors import VisthrowError
 from visthrow.task import Experiment, load_experiment, plant_of
@@ -39,7 +39,7 @@ THREADS_BAR = 1.8  # two threads on two cores over one
 
 
 @contextlib.contextmanager
-def on_one_core(core: int | None = None) -> Iterator[int | None]:
+def pin_to_one_core(core: int | None = None) -> Iterator[int | None]:
     """Keep the process on one core; yields its number, None where the system cannot do it.
 
     Raises:
@@ -102,7 +102,7 @@ def cost_in_c(scene: Any, seconds: float) -> float:
     return spent / (steps * scene.step)
 
 
-def interleaved(
+def measure_interleaved(
     a: Callable[[], float], b: Callable[[], float], repeats: int
 ) -> list[tuple[float, float]]:
     """Measure A B A B ...; each pair sees about the same machine."""
@@ -144,18 +144,18 @@ def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float
 
     hard = mujoco_c.HARD_THROW
     numerics = plant.sim
-    truth = converged(hard)
+    truth = run_converged(hard)
 
-    def off(ball_w: np.ndarray, pos_w: np.ndarray) -> tuple[float, float]:
+    def measure_difference(ball_w: np.ndarray, pos_w: np.ndarray) -> tuple[float, float]:
         return float(np.linalg.norm(ball_w - truth.ball_pos_w[-1])), float(
             np.linalg.norm(pos_w - truth.pos_w[-1])
         )
 
-    def of_mujoco(**how: Any) -> tuple[float, float]:
-        run = converged(hard, **how)
-        return off(run.ball_pos_w[-1], run.pos_w[-1])
+    def run_mujoco(**how: Any) -> tuple[float, float]:
+        run = run_converged(hard, **how)
+        return measure_difference(run.ball_pos_w[-1], run.pos_w[-1])
 
-    step = longest_accurate_step(lambda h: max(of_mujoco(step=h)), hard.duration, TOLERANCE)
+    step = longest_accurate_step(lambda h: max(run_mujoco(step=h)), hard.duration, TOLERANCE)
     implicit = {
         "step": mujoco_c.IMPLICIT_STEP,
         "integrator": "implicitfast",
@@ -163,17 +163,17 @@ def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float
     }
     ours = fly(hard, numerics.substep, numerics.precision, numerics.control_period)
     errors = {
-        "ours": off(ours.ball_pos_w, ours.pos_w),
-        "RK4": of_mujoco(step=step),
-        "implicitfast": of_mujoco(**implicit),
+        "ours": measure_difference(ours.ball_pos_w, ours.pos_w),
+        "RK4": run_mujoco(step=step),
+        "implicitfast": run_mujoco(**implicit),
     }
     name = (
         f"MuJoCo C, implicitfast, armature {mujoco_c.ARMATURE:g},"
         f" {mujoco_c.IMPLICIT_STEP * 1e3:g} ms"
     )
     return {
-        "RK4": mujoco_c.timed_scene(hard, f"MuJoCo C, RK4, {step * 1e3:g} ms", step),
-        "implicitfast": mujoco_c.timed_scene(hard, name, **implicit),
+        "RK4": mujoco_c.time_scene(hard, f"MuJoCo C, RK4, {step * 1e3:g} ms", step),
+        "implicitfast": mujoco_c.time_scene(hard, name, **implicit),
     }, errors
 
 
@@ -190,12 +190,12 @@ def measure(
     rivals, errors = contenders(plant) if with_mujoco else ({}, {})
     ours = {kind: Batch(experiment, batch, kind) for kind in commands.KINDS}
     pairs: dict[str, list[tuple[float, float]]] = {}
-    with on_one_core(core) as used:
+    with pin_to_one_core(core) as used:
         for warm in ours.values():
             warm.cost(0.1 * seconds)
         for name, scene in rivals.items():
             cost_in_c(scene, 0.1 * seconds)
-            pairs[name] = interleaved(
+            pairs[name] = measure_interleaved(
                 lambda: ours["hover"].cost(seconds), lambda s=scene: cost_in_c(s, seconds), repeats
             )
         full = [ours["full"].cost(seconds) for _ in range(repeats)]
@@ -260,7 +260,7 @@ def measure_threads(
     one, many = (Batch(experiment, batch, "hover", n) for n in (1, threads))
     for warm in (one, many):
         warm.cost(0.1 * seconds)
-    pairs = interleaved(lambda: one.cost(seconds), lambda: many.cost(seconds), repeats)
+    pairs = measure_interleaved(lambda: one.cost(seconds), lambda: many.cost(seconds), repeats)
     ratio = statistics.median(a / b for a, b in pairs)
     for each in (one, many):
         each.sim.episode.zero_()

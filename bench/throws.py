@@ -61,7 +61,7 @@ def series(args: argparse.Namespace) -> Report:
         left = [s for s in seeds if ("wire", s) not in kept]
 
         def fly(seed: int, cores: tuple[int | None, int | None]) -> dict[str, Any]:
-            return _over_the_wire(
+            return _throw_over_wire(
                 seed, folder / f"{args.policy.replace(os.sep, '_')}-{seed}", args, cores
             )
 
@@ -111,7 +111,7 @@ def _direct(seeds: list[int], args: argparse.Namespace) -> Any:
             raise VisthrowError(f"the throws without a wire failed: {process.stderr.read()}")
 
 
-def _over_the_wire(
+def _throw_over_wire(
     seed: int, folder: Path, args: argparse.Namespace, cores: tuple[int | None, int | None]
 ) -> dict[str, Any]:
     shutil.rmtree(folder, ignore_errors=True)  # half a run of an interrupted series
@@ -147,7 +147,7 @@ def _over_the_wire(
         "held_back": summary["held_back"],
         "latency_ms": summary["latency"],
         "speed": args.speed,
-        "separation_lag": _apart(report),
+        "separation_lag": _separation_lag(report),
     }
     if landed is not None:
         goal_w = landing.get("goal_w", (2.0, 0.0, 0.0))
@@ -158,7 +158,7 @@ def _over_the_wire(
     return line
 
 
-def _apart(report: dict[str, Any]) -> float | None:
+def _separation_lag(report: dict[str, Any]) -> float | None:
     """From the release's arrival to separation, on the plant's clock [s]."""
     times = report["separation_time"], report["release_time"]
     return None if None in times else times[0] - times[1]

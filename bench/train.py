@@ -75,7 +75,7 @@ def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
 
 
 @rounded_products(True)
-def alone(trainer: Any, repeats: int) -> dict[str, float]:
+def time_parts_alone(trainer: Any, repeats: int) -> dict[str, float]:
     """Median wall time [s] of an iteration's simulator steps, environment steps and policy calls,
     each alone.
 
@@ -194,7 +194,7 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     trainer = Trainer(experiment, device, seed=1)
     runs = whole(trainer, iterations)
     total = {key: statistics.median(values) for key, values in runs.items()}
-    parts = split(total, alone(trainer, repeats))
+    parts = split(total, time_parts_alone(trainer, repeats))
     samples = trainer.algorithm.samples
     wall = sum(total.values())
     rows = [

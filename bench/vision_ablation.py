@@ -49,7 +49,7 @@ RESERVE = 15.0
 """Least remaining time to start a training, and the time reserved for its throws [s]."""
 
 
-def trained(trainer: Any, seconds: float) -> dict[str, Any]:
+def train(trainer: Any, seconds: float) -> dict[str, Any]:
     """Train to the last iteration, or faster through the schedule so that it ends in time."""
     begin = time.perf_counter()
     planned = trainer.algorithm.iterations
@@ -70,7 +70,7 @@ def trained(trainer: Any, seconds: float) -> dict[str, Any]:
     }
 
 
-def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
+def throw_all(policy: Any, device: str, count: int) -> dict[str, Any]:
     """Throws at all targets, and at one with each fault."""
     from visthrow.throws.loading import training_experiment
     from visthrow.training import protocol
@@ -98,9 +98,9 @@ def job(args: argparse.Namespace) -> int:
     experiment = load_experiment(base, [*changes, *args.overrides])
     folder.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(experiment, args.devices[0], seed)
-    figures = trained(trainer, limit)
+    figures = train(trainer, limit)
     policy = finish(trainer, folder, {"training": figures})
-    figures["throws"] = thrown(policy, args.devices[0], args.throws)
+    figures["throws"] = throw_all(policy, args.devices[0], args.throws)
     write_json(folder / "figures.json", {"variant": name, "seed": seed, **figures})
     return 0
 

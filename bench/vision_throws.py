@@ -95,7 +95,7 @@ class Rival:
         return self.policy.act(torch.cat(parts, dim=-1))
 
 
-def thrown(
+def throw_row(
     name: str, overrides: Sequence[str], target: float, calibrate: bool = False
 ) -> dict[str, float]:
     """Throws of a row under one condition: mean and 95 % interval of the error, lowest and highest
@@ -149,7 +149,7 @@ def run(args: argparse.Namespace) -> int:
         for condition, (target, change) in conditions(layout, args.calibrated).items():
             status(f"{label}: {condition}")
             calibrate = "calibrated" in condition
-            figures[label][condition] = thrown(name, change, target, calibrate)
+            figures[label][condition] = throw_row(name, change, target, calibrate)
     status("")
     return finish(_report(figures), args)
 

@@ -54,7 +54,7 @@ def _turn_back(world: World) -> wp.Kernel:
 
 
 @contextlib.contextmanager
-def held_in_world() -> Iterator[None]:
+def register_world_held() -> Iterator[None]:
     """Let ``sim.solver`` "exchanged_chain" mean :class:`WorldHeldChain`."""
     name = "exchanged_chain"
     usual = solvers.SOLVERS["exchanged_chain"]

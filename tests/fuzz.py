@@ -16,7 +16,7 @@ KINDS = tuple(sorted(mav.mavlink_map))
 """Numbers of all messages of the dialect."""
 
 
-def framed(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
+def frame_message(kind, body: bytes, ids: tuple[int, int] = (1, 1)) -> bytes:
     """A message with the vehicle's ids and a right checksum over any content, so that its fields
     reach the listeners.
     """
@@ -32,7 +32,7 @@ def any_message(
 ) -> bytes:
     """A message of one of the kinds with any bits in its fields."""
     kind = mav.mavlink_map[kinds[rng.integers(len(kinds))]]
-    return framed(kind, rng.bytes(kind.unpacker.size), ids)
+    return frame_message(kind, rng.bytes(kind.unpacker.size), ids)
 
 
 def noise(rng: np.random.Generator) -> bytes:
@@ -40,7 +40,7 @@ def noise(rng: np.random.Generator) -> bytes:
     return rng.bytes(int(rng.integers(0, 300)))
 
 
-def mutated(rng: np.random.Generator, good: list[bytes]) -> bytes:
+def mutate(rng: np.random.Generator, good: list[bytes]) -> bytes:
     """Return one of some messages with up to five bytes changed, cut, or run together
     with another.
     """

@@ -16,7 +16,7 @@ AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
 """Of a policy that hovers and releases at once: the payload falls straight down."""
 
 
-def saved_policy(folder: Path, action=AT_ONCE) -> str:
+def save_policy(folder: Path, action=AT_ONCE) -> str:
     """File of a policy with a constant action, as an override of a config."""
     path = folder / "always.npz"
     simple_policy(action, "vision").save(path)

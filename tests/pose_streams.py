@@ -32,7 +32,7 @@ def regular(rate: float) -> Callable[[np.random.Generator], Iterator[Sample]]:
     return samples
 
 
-def restamped(change: Callable[[Sample], float]):
+def restamp(change: Callable[[Sample], float]):
     """Regular samples of 100 Hz with other stamps [us]."""
 
     def samples(rng):
@@ -79,14 +79,14 @@ STREAMS = {
     "a ball of zeros": PoseStream("", ball=(0.0,) * 4),
     "1 Hz": PoseStream("vehicle: 1.0 good poses a second; expected 36 or more", regular(1.0)),
     "8 Hz": PoseStream("8.0 good poses a second; expected 36 or more", regular(8.0)),
-    "zero": PoseStream("stamps are 0 s: the sender does not stamp", restamped(lambda s: 0)),
-    "constant": PoseStream("stamps are 5 s: the sender does not stamp", restamped(lambda s: 5e6)),
+    "zero": PoseStream("stamps are 0 s: the sender does not stamp", restamp(lambda s: 0)),
+    "constant": PoseStream("stamps are 5 s: the sender does not stamp", restamp(lambda s: 5e6)),
     "huge": PoseStream(
         "stamps that are no time)",
-        restamped(lambda s: 2**63 + s[1]),
+        restamp(lambda s: 2**63 + s[1]),
     ),
-    "backward": PoseStream("stamps run backward, from", restamped(lambda s: 1e9 - s[1])),
-    "ahead": PoseStream("stamps advance by 1e+03 s in a second", restamped(lambda s: 1e3 * s[1])),
+    "backward": PoseStream("stamps run backward, from", restamp(lambda s: 1e9 - s[1])),
+    "ahead": PoseStream("stamps advance by 1e+03 s in a second", restamp(lambda s: 1e3 * s[1])),
     "nan": PoseStream("NaN instead of unit quaternions: the source gives", quat=(math.nan,) * 4),
     "no quaternion": PoseStream("no good pose of the vehicle", quat=(0.0,) * 4),
     "frame": PoseStream("frame LOCAL_FLU is not taken", frame=mav.MAV_FRAME_LOCAL_FLU),

@@ -29,7 +29,7 @@ def _fine() -> np.ndarray:
     return np.linspace(0.0, LENGTH, FINE * (KNOTS - 1) + 1)
 
 
-def _placed(time: np.ndarray, forces: np.ndarray) -> np.ndarray:
+def _integrate(time: np.ndarray, forces: np.ndarray) -> np.ndarray:
     """Positions of a unit mass under forces at fine times, shape (T, n) from (F, n)."""
     fine = _fine()
     speed = np.cumsum(forces, axis=0) * fine[1]
@@ -39,7 +39,9 @@ def _placed(time: np.ndarray, forces: np.ndarray) -> np.ndarray:
 
 def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Position after a unit force on a unit mass at each knot (triangles), shape (T, knots)."""
-    return _placed(time, np.array([np.interp(_fine(), knots, row) for row in np.eye(len(knots))]).T)
+    return _integrate(
+        time, np.array([np.interp(_fine(), knots, row) for row in np.eye(len(knots))]).T
+    )
 
 
 def explain_without_laws(model: Model) -> diagnose_flights.Diagnosis:
@@ -47,7 +49,7 @@ def explain_without_laws(model: Model) -> diagnose_flights.Diagnosis:
     return diagnose_flights.explain(model, laws=False)
 
 
-def linearised(model: Model) -> Point:
+def linearise_flights(model: Model) -> Point:
     """Return a model's flights linearised where no effect acts."""
     windows = model.windows({})
     problem = Problem.of(model, windows, range(len(windows)))
@@ -56,7 +58,7 @@ def linearised(model: Model) -> Point:
 
 def selector_of(model: Model) -> Selector:
     """Return a search that has begun with a model's flights and looks for no laws."""
-    return Selector(linearised(model), 5.0, laws=False)
+    return Selector(linearise_flights(model), 5.0, laws=False)
 
 
 def catalogue(count: int) -> tuple[Effect, ...]:
@@ -203,7 +205,7 @@ class SyntheticModel(Model):
         """What the law adds to the measured positions, shape (6 n,)."""
         forces = self._law(moves).reshape(2, 3, -1)
         return np.concatenate(
-            [(_placed(self._time, forces[m].T) / MASS[m]).ravel() for m in range(2)]
+            [(_integrate(self._time, forces[m].T) / MASS[m]).ravel() for m in range(2)]
         )
 
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
@@ -242,13 +244,13 @@ class SyntheticModel(Model):
         return [w.residual - self._answer(w.effects, sizes) for w in self._windows]
 
 
-def altered(change: Callable[[SyntheticModel, Window], Window], **options) -> SyntheticModel:
+def alter_windows(change: Callable[[SyntheticModel, Window], Window], **options) -> SyntheticModel:
     """Return flights with a change applied to each of their windows."""
     model = SyntheticModel(**options)
     model._windows = [change(model, w) for w in model._windows]
     return model
 
 
-def pushed(model: SyntheticModel, window: Window, **sizes: float) -> Window:
+def push_window(model: SyntheticModel, window: Window, **sizes: float) -> Window:
     """Return a window in which effects of some sizes, in floors, act besides."""
     return replace(window, residual=window.residual + model._answer(window.effects, sizes))

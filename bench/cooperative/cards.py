@@ -105,7 +105,7 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
             return
 
 
-def placed(text: str) -> tuple[str, int]:
+def parse_placement(text: str) -> tuple[str, int]:
     """Read ``CONFIG:CARD``. Raises ArgumentTypeError: other text."""
     config, _, card = text.rpartition(":")
     if not config or not card.isdigit():
@@ -120,7 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seconds", type=float, default=540.0, help="for all of it")
     parser.add_argument(
         "--jobs",
-        type=placed,
+        type=parse_placement,
         nargs="+",
         metavar="CONFIG:CARD",
         default=[("pair", 0), ("pair_vision", 1)],

@@ -40,7 +40,7 @@ def with_values(
     return FlightLog(channels, dict(log.meta))
 
 
-def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
+def turn_hall(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
     """The same flight in a hall whose axes are turned about the vertical [rad] and moved [m]."""
     c = np.cos(angle)
     s = np.sin(angle)
@@ -56,7 +56,7 @@ def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
     return with_values(log, {"pos_w": place, "payload_pos_w": place, "quat_wb": quat})
 
 
-def mirrored(log: FlightLog) -> FlightLog:
+def mirror_flight(log: FlightLog) -> FlightLog:
     """The same flight mirrored left to right: y of positions changes sign, and so do rotations
     about x and z.
     """
@@ -81,7 +81,7 @@ def later(log: FlightLog, seconds: float) -> FlightLog:
     return with_values(log, {}, lambda t: t + seconds)
 
 
-def scrambled(logs: Sequence[FlightLog]) -> list[FlightLog]:
+def scramble_poses(logs: Sequence[FlightLog]) -> list[FlightLog]:
     """Commands of one flight with the poses of the next of about the same length."""
     groups: dict[int, list[int]] = {}
     for i, log in enumerate(logs):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnose.altered import later, scrambled, with_values
+from bench.diagnose.altered import later, scramble_poses, with_values
 from bench.diagnose.cases import command_for, environment, logs_of
 from bench.diagnose.sealed import WITHOUT_TESTS
 from bench.worlds.world import Recipe
@@ -31,14 +31,14 @@ FULL_THRUST = 14.0
 """What the configured controller calls full: four times ``max_thrust`` of configs/vehicle [N]."""
 
 
-def each(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Logs]:
+def change_all(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Logs]:
     """The same change to all logs."""
     return lambda logs: [change(log) for log in logs]
 
 
 def values(**changes) -> Callable[[Logs], Logs]:
     """Channels' values changed in all logs."""
-    return each(lambda log: with_values(log, changes))
+    return change_all(lambda log: with_values(log, changes))
 
 
 def cut(log: FlightLog, count: int) -> FlightLog:
@@ -52,7 +52,7 @@ def cut(log: FlightLog, count: int) -> FlightLog:
     )
 
 
-def exchanged(log: FlightLog) -> FlightLog:
+def exchange_bodies(log: FlightLog) -> FlightLog:
     """Vehicle and payload taken for each other."""
     channels = dict(log.channels)
     channels["pos_w"], channels["payload_pos_w"] = channels["payload_pos_w"], channels["pos_w"]
@@ -65,7 +65,7 @@ def late_commands(log: FlightLog) -> FlightLog:
     return FlightLog(dict(log.channels) | moved.channels, {})
 
 
-def frozen(log: FlightLog) -> FlightLog:
+def freeze_tracking(log: FlightLog) -> FlightLog:
     """A tracking system that stops in the middle of the flight."""
 
     def hold(x: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ def frozen(log: FlightLog) -> FlightLog:
     return with_values(log, {"pos_w": hold, "quat_wb": hold, "payload_pos_w": hold})
 
 
-def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
+def stand_still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
     """A vehicle at rest for a given time: noise about one position, one command."""
     rng = np.random.default_rng(1)
     t = np.arange(0.0, seconds, 1.0 / rate)
@@ -93,7 +93,7 @@ def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> 
     )
 
 
-def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
+def wander(seconds: float, rate: float = 100.0) -> FlightLog:
     """A slowly wandering hover of given length: paths, attitudes and commands of a vehicle without
     blade flapping, rate lag or battery drain.
     """
@@ -139,7 +139,9 @@ def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
 
 def without(name: str) -> Callable[[Logs], Logs]:
     """A channel that was not recorded."""
-    return each(lambda log: FlightLog({n: c for n, c in log.channels.items() if n != name}, {}))
+    return change_all(
+        lambda log: FlightLog({n: c for n, c in log.channels.items() if n != name}, {})
+    )
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def fair(done: subprocess.CompletedProcess, verdict: dict, right: Mapping[str, f
     )
 
 
-def doubled(logs: Logs) -> Logs:
+def double_flights(logs: Logs) -> Logs:
     """Every flight twice."""
     return [*logs, *[later(log, 1000.0) for log in logs]]
 
@@ -211,19 +213,19 @@ def command_values(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Logs
     return values(command=change)
 
 
-def standing(_: Sequence[FlightLog]) -> Logs:
+def idle_on_floor(_: Sequence[FlightLog]) -> Logs:
     """On the floor for half a minute, motors idle."""
-    return [still(30.0, 0.3, 0.05)] * 2
+    return [stand_still(30.0, 0.3, 0.05)] * 2
 
 
 def hours(_: Sequence[FlightLog]) -> Logs:
     """One hover of two hours."""
-    return [wandering(3600.0 * HOURS)]
+    return [wander(3600.0 * HOURS)]
 
 
 def hours_still(_: Sequence[FlightLog]) -> Logs:
     """One vehicle that stays in its place to the millimetre for two hours."""
-    return [still(3600.0 * HOURS, 2.07, 1.5)]
+    return [stand_still(3600.0 * HOURS, 2.07, 1.5)]
 
 
 BAD = {
@@ -238,17 +240,17 @@ BAD = {
     ),
     "scalar_first": Bad(values(quat_wb=lambda q: q[:, [3, 0, 1, 2]])),
     "world_to_body": Bad(values(quat_wb=lambda q: q * [-1.0, -1.0, -1.0, 1.0])),
-    "bodies_exchanged": Bad(each(exchanged)),
-    "late_commands": Bad(each(late_commands)),
-    "frozen": Bad(each(frozen)),
-    "copied": Bad(doubled),
-    "mixed_up": Bad(scrambled),
-    "three_samples": Bad(each(lambda log: cut(log, 3))),
+    "bodies_exchanged": Bad(change_all(exchange_bodies)),
+    "late_commands": Bad(change_all(late_commands)),
+    "frozen": Bad(change_all(freeze_tracking)),
+    "copied": Bad(double_flights),
+    "mixed_up": Bad(scramble_poses),
+    "three_samples": Bad(change_all(lambda log: cut(log, 3))),
     "no_commands": Bad(without("command")),
     "no_attitude": Bad(without("quat_wb")),
     "truncated": Bad(as_they_are, cut_to=0.6),
     "empty_files": Bad(as_they_are, cut_to=0.0),
-    "standing": Bad(standing, flown=False),
+    "standing": Bad(idle_on_floor, flown=False),
     # its blades do not flap, and its rates follow the commands at once
     "two_hours": Bad(hours, flown=False, right={"flapping": -1.0, "rate_gain": 1.0}),
     "two_hours_still": Bad(hours_still, flown=False),

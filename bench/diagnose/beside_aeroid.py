@@ -65,7 +65,7 @@ def slope(state: np.ndarray, size: dict[str, float]) -> np.ndarray:
     return np.append(vel, -size["ball_drag"] * np.sqrt(air @ air) * air - [0.0, 0.0, GRAVITY])
 
 
-def by_aeroid(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
+def estimate_by_aeroid(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
     """Estimates and standard errors; initial states of the throws are estimated with the
     parameters.
     """
@@ -106,7 +106,7 @@ def model_of(stamps: np.ndarray, positions: np.ndarray) -> BallModel:
     )
 
 
-def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
+def estimate_by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, float]]:
     """Estimates of the diagnosis' estimator, with the same parameter names."""
     fitted = fitting.fit(model_of(stamps, positions), NAMES)
     return {
@@ -115,13 +115,13 @@ def by_fit(stamps: np.ndarray, positions: np.ndarray) -> dict[str, tuple[float, 
     }
 
 
-def compared(seed: int, colour: str) -> dict:
+def compare_world(seed: int, colour: str) -> dict:
     """One world: errors and standard errors of both, seconds, and the diagnosis without names."""
     truth, stamps, paths = world(seed)
     rng = np.random.default_rng([seed, 1])
     positions = paths + SIGMA * np.array([sensor_noise(rng, colour, path.shape) for path in paths])
     line = {"seed": seed, "noise": colour or "white", "truth": truth}
-    for who, ask in (("aeroid", by_aeroid), ("fit", by_fit)):
+    for who, ask in (("aeroid", estimate_by_aeroid), ("fit", estimate_by_fit)):
         begin = time.perf_counter()
         estimates = ask(stamps, positions)
         line[who] = {
@@ -183,7 +183,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=240000001)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    lines = [compared(args.seed + i, colour) for i in range(args.worlds) for colour in COLOURS]
+    lines = [compare_world(args.seed + i, colour) for i in range(args.worlds) for colour in COLOURS]
     args.out.write_text(
         json.dumps({"seed": args.seed, "summary": summary(lines), "worlds": lines}, indent=1) + "\n"
     )

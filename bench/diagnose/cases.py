@@ -24,8 +24,15 @@ from pathlib import Path
 import numpy as np
 
 from bench.diagnose import altered
-from bench.diagnose.sealed import ALIKE, WITHOUT_TESTS, _alone, flight_log, model_of, named_by
-from bench.worlds.world import FLOORS, ONE_SIDED, PLANTS, Recipe, fly_recipe, recorded
+from bench.diagnose.sealed import (
+    ALIKE,
+    WITHOUT_TESTS,
+    _pin_worker,
+    flight_log,
+    model_of,
+    named_causes,
+)
+from bench.worlds.world import FLOORS, ONE_SIDED, PLANTS, Recipe, fly_recipe, record_flights
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog
 
@@ -92,7 +99,7 @@ def tool(folder: Path, *arguments: str, timeout: float = 1500.0) -> str:
     return done.stdout
 
 
-def explained(
+def explain_logs(
     folder: Path,
     logs: Sequence[FlightLog],
     recipe: Recipe,
@@ -127,7 +134,7 @@ def is_right(verdict: dict, name: str) -> bool:
     """Whether one cause is named: this one, alone or in a class that holds it, or one that such
     flights hardly distinguish from it.
     """
-    groups = named_by(verdict)
+    groups = named_causes(verdict)
     near = {name}.union(*(a for a in ALIKE if name in a))
     return len(groups) == 1 and bool(groups[0] & near)
 
@@ -154,7 +161,7 @@ def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: t
     )
 
 
-def configured(theta: dict[str, float], path: Path) -> str:
+def write_config(theta: dict[str, float], path: Path) -> str:
     """Write the configuration in which the model has these effects; the path as text."""
     from visthrow.diagnose.apply import patch
     from visthrow.task import load_experiment
@@ -167,10 +174,10 @@ def configured(theta: dict[str, float], path: Path) -> str:
 
 def logs_of(recipe: Recipe) -> list[FlightLog]:
     """Fly a world."""
-    return [flight_log(record) for record in recorded(recipe, fly_recipe(recipe))]
+    return [flight_log(record) for record in record_flights(recipe, fly_recipe(recipe))]
 
 
-def hidden(recipe: Recipe) -> tuple[str, float]:
+def hidden_effect(recipe: Recipe) -> tuple[str, float]:
     """The one effect of a world."""
     return next(iter(recipe.effects.items()))
 
@@ -183,17 +190,17 @@ def mirror(recipe: Recipe, folder: Path) -> dict:
     """A nominal world and a model with the recipe's effects: the diagnosis must find the opposite
     correction.
     """
-    name, size = hidden(recipe)
-    verdict = explained(
-        folder, logs_of(_bare(recipe)), recipe, configured(recipe.effects, folder / "model.toml")
+    name, size = hidden_effect(recipe)
+    verdict = explain_logs(
+        folder, logs_of(_bare(recipe)), recipe, write_config(recipe.effects, folder / "model.toml")
     )
     return {"passed": is_right(verdict, name) and size_is(verdict, name, -size), "said": verdict}
 
 
 def swap(recipe: Recipe, folder: Path) -> dict:
     """The effect is in world and model: nothing may be found."""
-    verdict = explained(
-        folder, logs_of(recipe), recipe, configured(recipe.effects, folder / "model.toml")
+    verdict = explain_logs(
+        folder, logs_of(recipe), recipe, write_config(recipe.effects, folder / "model.toml")
     )
     return {"passed": verdict["overall"] == "NO EFFECT", "said": verdict}
 
@@ -201,11 +208,11 @@ def swap(recipe: Recipe, folder: Path) -> dict:
 def idempotence(recipe: Recipe, folder: Path) -> dict:
     """An effect that ``apply`` writes into the configuration must not be found again."""
     logs = logs_of(recipe)
-    first = explained(folder, logs, recipe)
+    first = explain_logs(folder, logs, recipe)
     (folder / "first.json").write_text(json.dumps(first))
     tool(folder, "diagnose", "apply", "first.json", "--out", "extended.toml", "--plants", "1")
     again = (
-        explained(folder, logs, recipe, str(folder / "extended.toml")) if names(first) else first
+        explain_logs(folder, logs, recipe, str(folder / "extended.toml")) if names(first) else first
     )
     return {
         "passed": bool(names(first)) and again["overall"] == "NO EFFECT",
@@ -216,7 +223,7 @@ def idempotence(recipe: Recipe, folder: Path) -> dict:
 
 def scramble(recipe: Recipe, folder: Path) -> dict:
     """Commands of one flight with poses of another: nothing may be named."""
-    verdict = explained(folder, altered.scrambled(logs_of(recipe)), recipe)
+    verdict = explain_logs(folder, altered.scramble_poses(logs_of(recipe)), recipe)
     return {
         "passed": (
             not names(verdict) and verdict["overall"] in ("DATA INCONSISTENT", "OUT OF DOMAIN")
@@ -245,8 +252,8 @@ def _twice(
     sizes=lambda theta: theta,
 ) -> dict:
     logs = logs_of(recipe)
-    first = explained(folder, logs, recipe)
-    second = explained(folder, change(logs), recipe)
+    first = explain_logs(folder, logs, recipe)
+    second = explain_logs(folder, change(logs), recipe)
     is_found = any(
         is_right(first, name) for name in recipe.effects
     )  # an effect missed here must be missed in the transformed logs, too
@@ -274,7 +281,7 @@ def turn(recipe: Recipe, folder: Path) -> dict:
     return _twice(
         recipe,
         folder,
-        lambda logs: [altered.turned(log, 0.5 * np.pi, (2.0, -1.0, 0.0)) for log in logs],
+        lambda logs: [altered.turn_hall(log, 0.5 * np.pi, (2.0, -1.0, 0.0)) for log in logs],
         sizes,
     )
 
@@ -282,7 +289,10 @@ def turn(recipe: Recipe, folder: Path) -> dict:
 def leftright(recipe: Recipe, folder: Path) -> dict:
     """Mirrored flights must give the mirrored verdict."""
     return _twice(
-        recipe, folder, lambda logs: [altered.mirrored(log) for log in logs], altered.mirrored_theta
+        recipe,
+        folder,
+        lambda logs: [altered.mirror_flight(log) for log in logs],
+        altered.mirrored_theta,
     )
 
 
@@ -429,7 +439,7 @@ def main() -> None:
     tasks = [task for task in tasks if (task.kind, task.recipe.digest()) not in done]
     tally: dict[str, Counter] = {}
     context = mp.get_context("spawn")
-    with context.Pool(args.jobs, _alone, (context.Value("i", args.slot),)) as pool:
+    with context.Pool(args.jobs, _pin_worker, (context.Value("i", args.slot),)) as pool:
         for line in pool.imap_unordered(run_case, tasks):
             if line is None:
                 continue

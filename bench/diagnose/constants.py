@@ -76,7 +76,7 @@ def right(line: dict) -> bool:
     if two_checkouts.is_null(line):
         return not line["new"]["named"]
     if two_checkouts.is_outside(line):
-        return two_checkouts.outside_right(line, "new")
+        return two_checkouts.judge_outside_law(line, "new")
     if two_checkouts.is_varying(line):
         return two_checkouts.varies_right(line, "new")
     return two_checkouts.names_right(line, "new")
@@ -97,7 +97,7 @@ def compare(args: argparse.Namespace) -> None:
     print(f"{len(worlds)} worlds answered by all")
     for variant, lines in answers.items():
         count = sum(right(lines[world]) for world in worlds)
-        inside = two_checkouts.covered([lines[world] for world in worlds], "new")
+        inside = two_checkouts.check_coverage([lines[world] for world in worlds], "new")
         print(f"{variant:20} {count} right, {sum(inside)} of {len(inside)} intervals hold")
         for world in sorted(worlds):
             before = answers[BASE][world]

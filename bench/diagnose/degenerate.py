@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnose.cases import explained
-from bench.diagnose.sealed import flight_log, named_by
+from bench.diagnose.cases import explain_logs
+from bench.diagnose.sealed import flight_log, named_causes
 from bench.worlds.follow import follow, table_of
 from bench.worlds.world import Recipe
 from visthrow.diagnose.inputs.measures import MEASUREMENTS
@@ -53,12 +53,12 @@ class Pair:
         ]
         logs = [flight_log(record) for record in follow(recipe, tables, 0)]
         about = ("--about", self.effect) if not self.alike else ()
-        answer = first = explained(folder, logs, recipe, action="plan", more=about)
+        answer = first = explain_logs(folder, logs, recipe, action="plan", more=about)
         done = []
         measured = []
         for number in range(1, ROUNDS + 1):
             if number > 1:
-                answer = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
+                answer = explain_logs(folder, logs, recipe, action="plan", more=(*about, *measured))
             if not answer["session"]:
                 break
             for proposal in (p for p in answer["proposals"] if p["name"] in answer["session"]):
@@ -66,19 +66,19 @@ class Pair:
                 effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
                 if effect is None:
                     payload = manoeuvre_of(proposal["name"]).payload
-                    logs += self.flown(recipe, answer, proposal, payload, len(done))
+                    logs += self.fly_proposal(recipe, answer, proposal, payload, len(done))
                     continue
                 error = effect.sd * np.random.default_rng([recipe.seed, len(done)]).normal()
                 value = recipe.effects.get(effect.effect, 0.0) + error
                 if abs(value) > CLEAR * effect.sd:
                     return self.line(first, answer, done, effect.effect == self.effect)
                 measured += ["--measured", f"{effect.effect}={effect.sd}"]
-            answer = explained(folder, logs, recipe, more=measured)
-            if self.named(answer):
+            answer = explain_logs(folder, logs, recipe, more=measured)
+            if self.names_alone(answer):
                 break
-        return self.line(first, answer, done, self.named(answer))
+        return self.line(first, answer, done, self.names_alone(answer))
 
-    def flown(
+    def fly_proposal(
         self, recipe: Recipe, answer: dict, proposal: dict, payload: bool, number: int
     ) -> list[FlightLog]:
         """Fly a proposal on the plant as often as it states, up to a limit."""
@@ -91,9 +91,9 @@ class Pair:
             )
         ]
 
-    def named(self, answer: dict) -> bool:
+    def names_alone(self, answer: dict) -> bool:
         """Whether the effect alone is named."""
-        return named_by(answer) == [{self.effect}]
+        return named_causes(answer) == [{self.effect}]
 
     def admits_ambiguity(self, answer: dict) -> bool:
         """Whether the first answer reports that these flights cannot distinguish the causes."""
@@ -102,7 +102,7 @@ class Pair:
                 next(f["verdict"] for f in answer["findings"] if f["name"] == self.effect)
                 == "NOT IDENTIFIABLE"
             )
-        return any(self.effect in group and group & self.alike for group in named_by(answer))
+        return any(self.effect in group and group & self.alike for group in named_causes(answer))
 
     def line(self, first: dict, last: dict, done: list, named: bool) -> dict:
         """The ledger's line."""

@@ -227,7 +227,7 @@ def explain(folder: Path, model: list[str]) -> dict:
     return json.loads(answer.read_text())
 
 
-def saying(overall: str, *names: str) -> dict:
+def make_verdict(overall: str, *names: str) -> dict:
     """A verdict that holds names alone."""
     findings = [
         {"name": name, "verdict": "FOUND", "estimate": 0.0, "sd": 1e9, "floor": 1.0}
@@ -243,21 +243,21 @@ def saying(overall: str, *names: str) -> dict:
 
 def blind(_: Path, __: list[str]) -> dict:
     """A spoilt tool that never finds an effect."""
-    return saying("NO EFFECT")
+    return make_verdict("NO EFFECT")
 
 
 def reader_of_file_names(folder: Path, _: list[str]) -> dict:
     """A spoilt tool that answers with the name of the first file."""
     name = sorted(folder.glob("*.npz"))[0].stem.partition("-")[2]
-    return saying("KNOWN", name)
+    return make_verdict("KNOWN", name)
 
 
 def always(name: str) -> Tool:
     """A spoilt tool that always names one frequent effect."""
-    return lambda folder, model: saying("KNOWN", name)
+    return lambda folder, model: make_verdict("KNOWN", name)
 
 
-def once(tool: Tool) -> Tool:
+def cache_answers(tool: Tool) -> Tool:
     """The same tool with a cache of its answers by files and model."""
     answers: dict[str, str] = {}
 
@@ -273,7 +273,7 @@ def once(tool: Tool) -> Tool:
     return ask_once
 
 
-def exchanged(one: str, other: str, real: Tool = explain) -> Tool:
+def exchange_effects(one: str, other: str, real: Tool = explain) -> Tool:
     """A spoilt tool: the real one with two effects exchanged."""
     names = {one: other, other: one}
 

@@ -88,7 +88,7 @@ FLIGHTS = 4
 FLOORS = 10.0
 
 
-def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
+def draw_world(seed: int) -> tuple[str, str, dict[str, float]]:
     """Vehicle, what is hidden ("" for nothing), and the world's numbers."""
     rng = np.random.default_rng([20261124, seed])
     name = ("crazyflie", "five_inch")[seed // 6 % 2]
@@ -107,14 +107,14 @@ def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
         world[kind] = STRENGTH[kind] * (base["body"] + base["ball"]) * rng.choice([-1.0, 1.0])
     elif kind is None:
         kind = str(rng.choice(list(HIDDEN)))
-        floor = next(e.floor for e in effects_of("flyer", known(name)) if e.name == kind)
+        floor = next(e.floor for e in effects_of("flyer", describe_vehicle(name)) if e.name == kind)
         world[HIDDEN[kind]] += (
             FLOORS * floor * (1.0 if kind in ONE_SIDED else rng.choice([-1.0, 1.0]))
         )
     return name, kind, world
 
 
-def known(name: str) -> FlyerParams:
+def describe_vehicle(name: str) -> FlyerParams:
     """The vehicle's numbers as its owner knows them."""
     c = CRAFT[name]
     return FlyerParams(
@@ -146,7 +146,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
-def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> FlightLog:
+def fly_lissajous(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> FlightLog:
     """One flight along a Lissajous figure, as its owner records it."""
     M = world["body"]
     m = world["ball"]
@@ -252,10 +252,12 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
             )
         y[12:16] /= np.linalg.norm(y[12:16])
         path.append(y)
-    return recorded(world, np.append(times, seconds), np.array(path), times, np.array(sent), rng)
+    return record_poses(
+        world, np.append(times, seconds), np.array(path), times, np.array(sent), rng
+    )
 
 
-def recorded(
+def record_poses(
     world: dict,
     clock: np.ndarray,
     path: np.ndarray,
@@ -293,12 +295,12 @@ def recorded(
 
 def diagnose_world(seed: int) -> dict:
     """Fly a world and diagnose it; returns a line of the ledger."""
-    name, hidden, world = drawn(seed)
+    name, hidden, world = draw_world(seed)
     line = {"seed": seed, "vehicle": name, "hidden": hidden}
     begin = time.process_time()
     try:
-        logs = [flown(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
-        diagnosis = diagnose_flights.explain(FlyerModel(logs, known(name)), seed=seed)
+        logs = [fly_lissajous(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
+        diagnosis = diagnose_flights.explain(FlyerModel(logs, describe_vehicle(name)), seed=seed)
     except (VisthrowError, ValueError, FloatingPointError) as error:
         return line | {"verdict": "failed", "why": str(error)[:200]}
     groups = [{f.name, *f.partners} for f in diagnosis.findings if f.name in diagnosis.theta]
@@ -306,12 +308,12 @@ def diagnose_world(seed: int) -> dict:
         "verdict": diagnosis.overall,
         "groups": [sorted(g) for g in groups],
         "laws": [law.formula for law in diagnosis.laws[:1]],
-        "judged": judged(hidden, groups, diagnosis.overall),
+        "judged": judge_answer(hidden, groups, diagnosis.overall),
         "seconds": time.process_time() - begin,
     }
 
 
-def judged(hidden: str, groups: list[set[str]], overall: str) -> str:
+def judge_answer(hidden: str, groups: list[set[str]], overall: str) -> str:
     """Judgement of an answer: right, class, missed or false; for a force outside the catalogue
     unknown, or part where names are given beside it.
     """

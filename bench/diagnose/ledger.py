@@ -23,7 +23,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from bench.diagnose.sealed import NOT_WAITED, TERMS, matched
+from bench.diagnose.sealed import NOT_WAITED, TERMS, match_names
 from bench.worlds.world import ALL_FLOORS, CAMERA_FLOORS
 
 DRAG = 0.51 / 1.04e-3
@@ -135,7 +135,9 @@ def curve(size: np.ndarray, named: np.ndarray) -> Curve:
     return Curve(half, width, weight / weight.sum())
 
 
-def within(interval: tuple[float, float, float], size: np.ndarray, scale: float = 1.0) -> str:
+def format_interval(
+    interval: tuple[float, float, float], size: np.ndarray, scale: float = 1.0
+) -> str:
     """A size and its interval as text, times ``scale``; values outside the flown sizes appear as a
     bound.
     """
@@ -164,7 +166,7 @@ def names(world: dict) -> tuple[int, int, int, int]:
     """Names given, right up to class, right and alone, and hidden effects that were found."""
     truth = truth_of(world)
     groups = [set(g) for g in world.get("named", ())]
-    stands_for = matched(groups, truth)
+    stands_for = match_names(groups, truth)
     right = sum(map(bool, stands_for))
     return (
         len(groups),
@@ -184,8 +186,8 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
         ),
         "|---|---:|---:|---:|---|---|---|---|---:|---:|---:|---:|---:|",
     ]
-    for kind, begun in grouped(worlds, lambda w: w["kind"]).items():
-        group = answered(begun)
+    for kind, begun in group_by_key(worlds, lambda w: w["kind"]).items():
+        group = answered_worlds(begun)
         finished = [w for w in group if "error" not in w]
         counts = np.array([names(w) for w in group]).reshape(-1, 4)
         given, right, exact, hits = map(int, counts.sum(0))
@@ -213,12 +215,12 @@ def dusty(world: dict) -> bool:
     return bool(world["recipe"].get("dust"))
 
 
-def answered(worlds: Sequence[dict]) -> list[dict]:
+def answered_worlds(worlds: Sequence[dict]) -> list[dict]:
     """Worlds whose verdict was not cut off."""
     return [w for w in worlds if w.get("error") != NOT_WAITED]
 
 
-def grouped(items: Iterable[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
+def group_by_key(items: Iterable[dict], key: Callable[[dict], str]) -> dict[str, list[dict]]:
     """Items by key, keys sorted."""
     out = defaultdict(list)
     for item in items:
@@ -280,7 +282,7 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
             fitted = curve(size, named)
             half = fitted.size(0.5)
             most = fitted.size(0.9)
-            row += [within(x, size, floor * factor) for x in (half, most)]
+            row += [format_interval(x, size, floor * factor) for x in (half, most)]
             row += [required, met(most, limit / floor)]
         else:
             row += ["-", "-", required, "too few worlds" if name in LIMITS else "-"]
@@ -347,7 +349,7 @@ def gains(worlds: Sequence[dict]) -> list[str]:
         "|---|---:|---:|---:|---:|---|---|",
     ]
     with_held = [w for w in worlds if "samples" in w.get("held", {})]
-    for kind, group in {**grouped(with_held, lambda w: w["kind"]), "all": with_held}.items():
+    for kind, group in {**group_by_key(with_held, lambda w: w["kind"]), "all": with_held}.items():
         ratio = [(gain_ratio(w["held"]), bool(w["named"])) for w in group]
         every = [r for r, _ in ratio if math.isfinite(r)]
         named = [r for r, any_named in ratio if any_named and math.isfinite(r)]
@@ -468,7 +470,7 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
 
 def summary(worlds: Sequence[dict]) -> str:
     """All tables as Markdown."""
-    answers = answered(worlds)
+    answers = answered_worlds(worlds)
     parts = {
         "What was named": accuracy(worlds),
         "By kind": kinds(answers),
@@ -518,7 +520,7 @@ def right(world: dict) -> bool:
 def kinds(worlds: Sequence[dict]) -> list[str]:
     """Table of the right verdicts by kind, and of the wrong ones."""
     lines = ["| kind | right verdicts | wrong verdicts | seconds |", "|---|---|---|---|"]
-    for kind, group in sorted(grouped(worlds, lambda w: w["kind"]).items()):
+    for kind, group in sorted(group_by_key(worlds, lambda w: w["kind"]).items()):
         wrong_verdicts = Counter(w.get("overall") for w in group if not right(w))
         other = ", ".join(f"{overall} {count}" for overall, count in sorted(wrong_verdicts.items()))
         seconds = np.median([w["explain_s"] for w in group])
@@ -531,7 +533,7 @@ def kinds(worlds: Sequence[dict]) -> list[str]:
 def plants(worlds: Sequence[dict]) -> list[str]:
     """Nulls with a name and singles found, by plant."""
     lines = ["| plant | nulls with a name | one effect: found | names wrong |", "|---|---|---|---|"]
-    for plant, group in grouped(worlds, lambda w: w["recipe"]["plant"]).items():
+    for plant, group in group_by_key(worlds, lambda w: w["recipe"]["plant"]).items():
         nulls = [w for w in group if not w["recipe"]["effects"] and not dusty(w)]
         one = [w for w in group if len(truth_of(w)) == 1 and not dusty(w)]
         given, right = np.array([names(w)[:2] for w in group]).sum(0)
@@ -578,9 +580,9 @@ def main() -> None:
     args = parser.parse_args()
     worlds = read(args.ledgers)
     print(summary(worlds))
-    if args.out and singles(answered(worlds)):
+    if args.out and singles(answered_worlds(worlds)):
         args.out.mkdir(parents=True, exist_ok=True)
-        draw(answered(worlds), args.out / "completeness.png")
+        draw(answered_worlds(worlds), args.out / "completeness.png")
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from bench.worlds.world import (
     draw,
     dust_of,
     fly_recipe,
-    recorded,
+    record_flights,
 )
 from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.likelihood.threads import limit_to_one_thread
@@ -199,7 +199,7 @@ def model_of(recipe: Recipe) -> list[str]:
 def hand_over(recipe: Recipe, folder: Path, held: Path | None = None) -> list[Path]:
     """Fly a world and write its logs; held-out ones into a separate folder."""
     paths = []
-    records = recorded(recipe, fly_recipe(recipe))
+    records = record_flights(recipe, fly_recipe(recipe))
     shown = len(records) - recipe.held
     for i, record in enumerate(records):
         if i < shown or held is not None:
@@ -254,7 +254,7 @@ def ask(
     return json.loads(answer.read_text())
 
 
-def on_held_back(
+def measure_held_back(
     recipe: Recipe, answers: dict[str, dict[str, float]], held: Path
 ) -> dict[str, float]:
     """Return the nats by which the plain model (``before``) and the sizes of each answer explain
@@ -281,7 +281,7 @@ def on_held_back(
     return {who: nats[different.index(s)] for who, s in sizes.items()} | {"samples": samples}
 
 
-def named_by(verdict: dict) -> list[set[str]]:
+def named_causes(verdict: dict) -> list[set[str]]:
     """Each cause that was named, as the set of names it may have: one for FOUND, several for a
     CLASS.
     """
@@ -296,21 +296,21 @@ def named_by(verdict: dict) -> list[set[str]]:
     return out
 
 
-def near(group: set[str], truth: set[str]) -> set[str]:
+def find_matches(group: set[str], truth: set[str]) -> set[str]:
     """Hidden effects that a name, or a class of names, matches: the same, or ones that flights
     hardly distinguish.
     """
     return {n for n in truth if group & ({n} | set().union(*(a for a in ALIKE if n in a)))}
 
 
-def matched(groups: list[set[str]], truth: set[str]) -> list[str]:
+def match_names(groups: list[set[str]], truth: set[str]) -> list[str]:
     """The hidden effect that each name, or class of names, matches, each once; "" where there is
     none.
 
     Exact matches come before effects that flights hardly distinguish."""
     out = [""] * len(groups)
     left = set(truth)
-    for meant in (set.intersection, near):
+    for meant in (set.intersection, find_matches):
         for i in sorted(range(len(groups)), key=lambda i: len(groups[i])):
             if not out[i] and (possible := meant(groups[i], left)):
                 out[i] = min(possible)
@@ -326,9 +326,9 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
     ``wrong``: names that are none of the hidden effects; ``missed``: hidden effects that were not
     named. A law outside the catalogue has no name: it is ``unknown`` that is right."""
     truth = {n for n in recipe.effects if not n.startswith("law_")}
-    groups = named_by(verdict)
+    groups = named_causes(verdict)
     covered = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
-    stands_for = matched(groups, truth)
+    stands_for = match_names(groups, truth)
     exact = sum(group == {name} for group, name in zip(groups, stands_for))
     hits = set(stands_for) - {""}
     wrong = stands_for.count("")
@@ -406,13 +406,13 @@ def run_world(
         if recipe.held and (recipe.effects or verdict.get("theta")):
             try:
                 answers = {"after": verdict.get("theta", {})}
-                line["held"] = on_held_back(recipe, answers, held)
+                line["held"] = measure_held_back(recipe, answers, held)
             except (VisthrowError, RuntimeError) as error:
                 line["held_error"] = repr(error)
     return line
 
 
-def _known(kind: str, begin: str, names: Iterable[str]) -> str:
+def _strip_prefix(kind: str, begin: str, names: Iterable[str]) -> str:
     """The name that follows the prefix of a kind.
 
     Raises:
@@ -426,7 +426,7 @@ def _known(kind: str, begin: str, names: Iterable[str]) -> str:
     return name
 
 
-def drawn(kind: str, number: int) -> Recipe:
+def draw_world(kind: str, number: int) -> Recipe:
     """A world of a kind:
 
     ``null``, ``law``, ``curve``, ``limit:NAME``, ``flights`` or ``EFFECTSxFLOORS``; those with a
@@ -439,7 +439,7 @@ def drawn(kind: str, number: int) -> Recipe:
     required limit, ``limit:NAME`` the named one, about its limit, ``camera`` any of a camera's,
     ``clear`` none. ``KIND+dust`` adds a little of every other effect."""
     if kind.endswith(DUSTY):
-        return replace(drawn(kind.removesuffix(DUSTY), number), dust=DUST)
+        return replace(draw_world(kind.removesuffix(DUSTY), number), dust=DUST)
     rng = np.random.default_rng(number + 7)
     if kind == "clear":
         return draw(
@@ -459,15 +459,15 @@ def drawn(kind: str, number: int) -> Recipe:
         floors = float(np.exp(rng.uniform(*np.log(ends))))
         return draw(number, 1, floors, names=(str(rng.choice(names)),), camera=True)
     if kind.startswith(LIMIT):
-        name = _known(kind, LIMIT, FLOORS)
+        name = _strip_prefix(kind, LIMIT, FLOORS)
         return draw(number, 1, float(np.exp(rng.uniform(*np.log((NEAREST, NEXT))))), names=(name,))
     if kind.startswith(NULL):
-        return draw(number, 0, 0.0, colour=_known(kind, NULL, COLOURS))
+        return draw(number, 0, 0.0, colour=_strip_prefix(kind, NULL, COLOURS))
     if kind.startswith(VARYING):
-        name = _known(kind, VARYING, VARIES)
+        name = _strip_prefix(kind, VARYING, VARIES)
         return draw(number, 0, 0.0, varies={name: float(rng.uniform(*VARIES[name]))})
     if kind.startswith(DRIFTING):
-        return replace(drawn(kind.replace(DRIFTING, VARYING), number), days=DAYS)
+        return replace(draw_world(kind.replace(DRIFTING, VARYING), number), days=DAYS)
     if kind == "lost":
         return draw(number, 0, 0.0, lost=float(rng.uniform(*LOST)))
     if kind == "null":
@@ -508,12 +508,12 @@ def bank(seed: int, sizes: dict[str, int]) -> list[tuple[str, Recipe]]:
     out: list[tuple[float, str, Recipe]] = []
     for k, (kind, count) in enumerate(sorted(sizes.items())):
         for i in range(count):
-            recipe = replace(drawn(kind, seed + 100_000 * k + 100 * i), held=HELD)
+            recipe = replace(draw_world(kind, seed + 100_000 * k + 100 * i), held=HELD)
             out.append(((i + 0.5) / count, kind, recipe))
     return [(kind, recipe) for _, kind, recipe in sorted(out, key=lambda item: item[:2])]
 
 
-def _alone(numbers) -> None:
+def _pin_worker(numbers) -> None:
     """Pin a worker to one core: processes that it starts count that one only."""
     cores = sorted(os.sched_getaffinity(0))
     with numbers.get_lock():
@@ -612,7 +612,9 @@ def main() -> None:
     tasks = [(kind, recipe, begin, end, args.verdicts) for kind, recipe in worlds]
     tally: dict[str, Counter] = {kind: Counter() for kind in sizes}
     context = mp.get_context("spawn")
-    with context.Pool(args.jobs, _alone, (context.Value("i", 0),), maxtasksperchild=None) as pool:
+    with context.Pool(
+        args.jobs, _pin_worker, (context.Value("i", 0),), maxtasksperchild=None
+    ) as pool:
         for line in pool.imap_unordered(_one, tasks):
             if line is None:
                 continue

@@ -62,7 +62,7 @@ it should.
 GROUND = "F = c 1/z 1/z z"
 
 
-def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLog:
+def record_swing(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLog:
     """One free swing, as its encoder sees it."""
     force = PULLS[law][1] if law else lambda v, down, pull: 0.0 * v
 
@@ -92,7 +92,7 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
     return FlightLog({"angle": Channel(stamps, np.round(angle / LINES) * LINES, "rad")})
 
 
-def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> FlightLog:
+def record_hover(law: str, rng: np.random.Generator, seconds: float = 25.0) -> FlightLog:
     """Logs of one slow flight up and down, by its motors and a capture."""
     stamps = np.arange(0.0, seconds, 0.02)
     low = rng.uniform(0.2, 0.35)
@@ -122,8 +122,8 @@ def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> Flight
 
 
 WORLDS = {
-    "pendulum": (swung, PendulumModel, SWING, ("", *PULLS)),
-    "trim": (hovered, TrimModel, HOVER, ("", "ground")),
+    "pendulum": (record_swing, PendulumModel, SWING, ("", *PULLS)),
+    "trim": (record_hover, TrimModel, HOVER, ("", "ground")),
 }
 """Generator, model of the diagnosis, numbers that its owner knows, and laws that may be hidden."""
 

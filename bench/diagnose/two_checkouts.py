@@ -99,20 +99,20 @@ def in_turn(trees: list[str], number: int) -> list[tuple[str, str]]:
 
 def answer_foreign(seed: int, trees: list[str], until: float) -> dict:
     """Answer a world of the other author's generator."""
-    vehicle, hidden, world = foreign.drawn(seed)
+    vehicle, hidden, world = foreign.draw_world(seed)
     line = {"bank": "foreign", "seed": seed, "kind": f"foreign:{hidden or 'null'}"}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for i in range(foreign.FLIGHTS):
-            log = foreign.flown(world, np.random.default_rng([seed, i]))
+            log = foreign.fly_lissajous(world, np.random.default_rng([seed, i]))
             log.save(folder / f"flight_{i}.npz")
         for side, tree in in_turn(trees, seed):
             verdict = answer_of(tree, [FOREIGN, vehicle, str(seed)], folder, until)
-            groups = sealed.named_by(verdict)
+            groups = sealed.named_causes(verdict)
             line[side] = {
                 "overall": verdict["overall"],
                 "named": [sorted(g) for g in groups],
-                "judged": foreign.judged(hidden, groups, verdict["overall"]),
+                "judged": foreign.judge_answer(hidden, groups, verdict["overall"]),
                 "seconds": verdict["seconds"],
                 "error": verdict.get("error", ""),
                 "reasons": verdict.get("reasons", [])[:2],
@@ -144,7 +144,7 @@ def answer_sealed(kind: str, recipe: Recipe, trees: list[str], until: float) -> 
             sizes[side] = verdict.get("theta", {})
         if has_names(line):
             try:
-                line["held"] = sealed.on_held_back(recipe, sizes, held)
+                line["held"] = sealed.measure_held_back(recipe, sizes, held)
             except (VisthrowError, RuntimeError, ValueError) as error:
                 line["held_error"] = repr(error)[:200]
     return line
@@ -199,7 +199,7 @@ def worlds_of(banks: Iterable[str], foreign_lists: Iterable[str]) -> list[tuple]
 def kind_of(world: tuple) -> str:
     """Return a world's kind, or ``null`` or ``hidden`` for the other author's."""
     if world[0] == "foreign":
-        return "foreign" if foreign.drawn(world[1])[1] else "foreign null"
+        return "foreign" if foreign.draw_world(world[1])[1] else "foreign null"
     return world[1]
 
 
@@ -223,7 +223,7 @@ def write_answers(
     """Do tasks in processes with a core each; append the answers to a ledger as they come."""
     context = mp.get_context("spawn")
     with (
-        context.Pool(jobs, sealed._alone, (context.Value("i", 0),)) as pool,
+        context.Pool(jobs, sealed._pin_worker, (context.Value("i", 0),)) as pool,
         path.open("a") as ledger,
     ):
         for line in pool.imap_unordered(answer_one, tasks):
@@ -281,7 +281,7 @@ def varies_right(line: dict, side: str) -> bool:
     return not answer["named"] and stated
 
 
-def covered(lines: Iterable[dict], side: str) -> list[bool]:
+def check_coverage(lines: Iterable[dict], side: str) -> list[bool]:
     """Return for each hidden effect that was named whether its interval holds the truth."""
     named = [
         e for line in lines for e in line[side].get("errors", ()) if e["named"] and e["estimate"]
@@ -300,7 +300,7 @@ def rightly(test: Callable[[dict, str], bool]) -> Callable[[dict, str], bool]:
     return lambda line, side: not line[side]["error"] and test(line, side)
 
 
-def paired(lines: list[dict], test: Callable[[dict, str], bool]) -> str:
+def compare_pairs(lines: list[dict], test: Callable[[dict, str], bool]) -> str:
     """Return how many worlds only one side has right, and the sign test's probability."""
     from scipy.stats import binomtest
 
@@ -333,9 +333,9 @@ def compare(args: argparse.Namespace) -> None:
         ("  triples", lambda line: line["kind"].startswith("3x"), names_right),
         ("  foreign", lambda line: has_names(line) and line["bank"] == "foreign", names_right),
         ("worlds without a wrong name", has_names, without_wrong),
-        ("laws: UNKNOWN, no name", is_outside, outside_right),
-        ("  in the grammar", lambda line: line["kind"] == "law", outside_right),
-        ("  beyond it", lambda line: line["kind"] == "beyond", outside_right),
+        ("laws: UNKNOWN, no name", is_outside, judge_outside_law),
+        ("  in the grammar", lambda line: line["kind"] == "law", judge_outside_law),
+        ("  beyond it", lambda line: line["kind"] == "beyond", judge_outside_law),
         ("varies, drifts, lost", is_varying, varies_right),
     )
     tests = tuple((name, belongs, rightly(test)) for name, belongs, test in tests)
@@ -346,13 +346,13 @@ def compare(args: argparse.Namespace) -> None:
         for side in sides:
             print(f"{name:30} {side} {interval(sum(test(p, side) for p in part), len(part))}")
         if len(sides) > 1:
-            print(f"{'':30} {paired(part, test)}")
+            print(f"{'':30} {compare_pairs(part, test)}")
     for kind in sorted({line["kind"] for line in lines if is_null(line)}):
         part = [line for line in lines if line["kind"] == kind]
         names = [f"{side} {sum(bool(line[side]['named']) for line in part)}" for side in sides]
         print(f"{kind:30} false names: {', '.join(names)} of {len(part)}")
     for side in sides:
-        inside = covered(lines, side)
+        inside = check_coverage(lines, side)
         print(f"{'95 % intervals hold the truth':30} {side} {interval(sum(inside), len(inside))}")
         gain = gains(lines, side)
         quarters = np.percentile(gain, [10, 25, 50, 75]) if len(gain) else []
@@ -366,7 +366,7 @@ def compare(args: argparse.Namespace) -> None:
                 f" {seconds.mean(0)}, geometric mean of the ratio {ratio:.2f}"
             )
     if args.list:
-        differing(lines, tests, sides)
+        print_differences(lines, tests, sides)
 
 
 def is_varying(line: dict) -> bool:
@@ -374,7 +374,7 @@ def is_varying(line: dict) -> bool:
     return line["kind"] == "lost" or line["kind"].startswith((sealed.VARYING, sealed.DRIFTING))
 
 
-def outside_right(line: dict, side: str) -> bool:
+def judge_outside_law(line: dict, side: str) -> bool:
     """Tell whether a hidden law is UNKNOWN without a name."""
     unknown = line[side]["overall"].startswith(("UNKNOWN", "EXPLAINED IN PART"))
     return unknown and not line[side]["named"]
@@ -387,7 +387,7 @@ def without_wrong(line: dict, side: str) -> bool:
     return not line[side]["wrong"]
 
 
-def differing(lines: list[dict], tests: tuple, sides: list[str]) -> None:
+def print_differences(lines: list[dict], tests: tuple, sides: list[str]) -> None:
     """Print each world that a side has wrong."""
     for name, belongs, test in tests:
         for line in lines:

@@ -12,7 +12,7 @@ import numpy as np
 from bench import start
 from bench.report import Report, Table, finish
 from sim.params import GRAVITY
-from tests.oracle.converged import OracleRun, converged
+from tests.oracle.converged import OracleRun, run_converged
 from tests.plants import SCENES
 from tests.scenes import Scene, Wrench, load_scene, wrench_at
 from tests.simulators import scene_sim
@@ -61,7 +61,7 @@ def pendulum() -> Scene:
     return dataclasses.replace(scene, **body, **still, direction=direction, schedule=schedule)
 
 
-def pulled(weights: float) -> Scene:
+def pull_up(weights: float) -> Scene:
     """The hard throw's vehicle, still, that pulls straight up with its rope 15 degrees askew."""
     scene = load_scene(SCENES / "hard_throw.toml")
     lift = weights * GRAVITY * scene.total_mass
@@ -74,7 +74,7 @@ def pulled(weights: float) -> Scene:
 @functools.cache
 def reference(scene: Scene) -> OracleRun:
     """MuJoCo's converged run."""
-    return converged(scene, times=PERIOD * np.arange(1, round(scene.duration / PERIOD) + 1))
+    return run_converged(scene, times=PERIOD * np.arange(1, round(scene.duration / PERIOD) + 1))
 
 
 def distances(scene: Scene, name: str, solver: str, substep: float) -> dict[str, float]:
@@ -98,7 +98,7 @@ def run(args) -> int:
             row = {"solver": solver, "substep": substep}
             for name, scene in scenes.items():
                 row |= distances(scene, name, solver, substep)
-            calm = [k for k in PULLS if fly(pulled(k), solver, substep)["rates"].max() < CALM]
+            calm = [k for k in PULLS if fly(pull_up(k), solver, substep)["rates"].max() < CALM]
             row["pull"] = max(calm, default=0)
             rows.append(row)
             print(row, flush=True)

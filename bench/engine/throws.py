@@ -19,7 +19,9 @@ MOVED = (
 )
 
 
-def thrown(policy: str, solver: str | None, target: float, args: Namespace) -> tuple[dict, list]:
+def throw_on_solver(
+    policy: str, solver: str | None, target: float, args: Namespace
+) -> tuple[dict, list]:
     """Throw a policy on one solver, by default its training's; returns the record, and landings
     [m].
     """
@@ -40,7 +42,7 @@ def run(args: Namespace) -> int:
     for policy in args.policies:
         for solver in args.solvers or [None]:
             for target in args.targets:
-                row, landing_w = thrown(policy, solver, target, args)
+                row, landing_w = throw_on_solver(policy, solver, target, args)
                 first = np.array(firsts.setdefault((policy, target), landing_w))
                 off = np.linalg.norm(np.array(landing_w) - first, axis=1)
                 row |= {"moved_median": float(np.median(off)), "moved_most": float(off.max())}

@@ -88,7 +88,7 @@ def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
 
 
 @contextmanager
-def opened(
+def open_runner(
     program: str | Path,
     folder: Path,
     params: HilParams,
@@ -143,7 +143,7 @@ def throw(
         params: of the run. policy: on the CPU. plant: what flies behind the firmware.
         mocap: its faults. seed: of noise and loss.
     """
-    with opened(program, folder, params, policy, plant, mocap, seed) as (
+    with open_runner(program, folder, params, policy, plant, mocap, seed) as (
         runner,
         source,
         clock,
@@ -155,14 +155,14 @@ def throw(
             clock.now() + np.random.default_rng([seed, 1]).uniform(0.0, 1.0 / mocap.rate)
         )
         recorder = RunRecorder(folder / "run", params)
-        summary = _flown(Loop(runner, source, clock, AutoOperator(), recorder), fake)
+        summary = _fly(Loop(runner, source, clock, AutoOperator(), recorder), fake)
         recorder.close(summary)
         for number, log in enumerate(throws(read(folder / "run")), start=1):
             log.save(throw_path(folder / "run", number, ".npz"))
         return {**fake.report(), "run": summary}
 
 
-def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
+def _fly(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
     """Take turns until the runner is done and the payload has lain for a while."""
     plant = fake.plant
     done = False

@@ -45,7 +45,7 @@ AT_ONCE = np.radians(2.0)
 """A set-point that comes so near to a command is that command [rad/s]."""
 
 
-def flown(folder: Path, step: float, seed: int) -> Path:
+def fly_throw(folder: Path, step: float, seed: int) -> Path:
     """A throw with the vehicle in steps of some length [s], every loop in the blackbox;
     its folder.
     """
@@ -66,7 +66,7 @@ def flown(folder: Path, step: float, seed: int) -> Path:
     return where
 
 
-def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
+def join_blackbox(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     """The throw's log with its blackbox."""
     (box,) = logs_of_blackbox(path := next(where.glob("LOG*")))
     (run,) = read(where / "run" / "throw-01.npz")
@@ -97,7 +97,7 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     return log
 
 
-def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
+def measure_residual(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
     """Mean square of the windows' gyro residual, in deviations of its noise, shape (3,)."""
     path = config.find("train", BASE)
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
@@ -135,9 +135,9 @@ def main() -> None:
         (SAMPLE, True, True),
     ):
         folder = args.out / f"{1e3 * step:g}ms"
-        throws = [flown(folder, step, seed) for seed in args.seeds]
-        residuals = left(
-            [joined(where, *of) for where in throws], next(throws[0].glob("LOG*")), folder
+        throws = [fly_throw(folder, step, seed) for seed in args.seeds]
+        residuals = measure_residual(
+            [join_blackbox(where, *of) for where in throws], next(throws[0].glob("LOG*")), folder
         )
         print(
             json.dumps(

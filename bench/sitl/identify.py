@@ -141,7 +141,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     return {"rows": np.array(rows), "starts": np.array(starts)}
 
 
-def changed(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
+def change_vehicle(vehicle: VehicleParams, theta: np.ndarray) -> VehicleParams:
     """A vehicle with the settings' controller, changed by `NAMES`: delay [s], voltage [V], 1 +
     logarithms of factors of the others.
     """
@@ -205,14 +205,14 @@ class Windows:
         rate_command = rows[np.maximum(late, 0), 15:18]
         rate = rows[:, 1:4]
 
-        def smoothed(values: np.ndarray, time_constant: float) -> np.ndarray:
+        def smooth(values: np.ndarray, time_constant: float) -> np.ndarray:
             share = 1.0 - np.exp(-PERIOD / time_constant)
             return lfilter(
                 [share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1]
             )[0]
 
-        setpoint = smoothed(rate_command, c.setpoint_time_constant)
-        gyro = smoothed(rate, c.gyro_time_constant)
+        setpoint = smooth(rate_command, c.setpoint_time_constant)
+        gyro = smooth(rate, c.gyro_time_constant)
         if c.kind != "motor_mixing":
             return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
         error = rate_command - rate - np.array(c.gyro_share) * (gyro - rate)
@@ -264,20 +264,20 @@ class Windows:
 def fit(
     windows: Windows, vehicle: VehicleParams, chosen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of :func:`changed`, and `REST`, that fit the chosen windows best."""
+    """Numbers of :func:`change_vehicle`, and `REST`, that fit the chosen windows best."""
     start = np.array([0.001, vehicle.controller.calibration_voltage, *np.ones(6), *np.zeros(3)])
     low = np.array([0.0, 14.0, *np.full(6, -3.0), *np.full(3, -5.0)])
     high = np.array([0.06, 18.0, *np.full(9, 5.0)])
     scale = [5e-3, 0.3, *np.full(6, 0.5), *np.full(3, 0.1)]
 
-    def off(theta: np.ndarray) -> np.ndarray:
+    def residual(theta: np.ndarray) -> np.ndarray:
         return (
-            windows.rates(changed(vehicle, theta[:8]), chosen, theta[8:])
+            windows.rates(change_vehicle(vehicle, theta[:8]), chosen, theta[8:])
             - windows.rows[chosen][:, :, 1:4]
         ).ravel()
 
     solution = least_squares(
-        off, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25
+        residual, start, bounds=(low, high), x_scale=scale, diff_step=1e-2, max_nfev=25
     )
     return solution.x[:8], solution.x[8:]
 
@@ -358,7 +358,7 @@ def main() -> None:
     )
     named = dataclasses.replace(shipped, controller=alone)
     theta, rest = fit(windows, named, fit_windows)
-    fitted = changed(named, theta)
+    fitted = change_vehicle(named, theta)
     (args.out / "vehicle.toml").write_text(config.dumps(fitted))
     figures = {
         "doublets": len(every),

@@ -86,7 +86,7 @@ class Wire(threading.Thread):
         return (commands - poses[newest])[newest >= 0]
 
 
-def flown(folder: Path, seconds: float, speed: float) -> dict:
+def fly_hover(folder: Path, seconds: float, speed: float) -> dict:
     """Hover through the firmware for a time; the report."""
     wire = Wire()
     pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL}
@@ -131,7 +131,7 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=1.0, help="of both clocks")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        print(json.dumps(flown(Path(folder), args.seconds, args.speed), indent=1))
+        print(json.dumps(fly_hover(Path(folder), args.seconds, args.speed), indent=1))
 
 
 if __name__ == "__main__":

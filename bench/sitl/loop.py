@@ -32,7 +32,9 @@ RECORD = Path(__file__).with_name("betaflight-4.6.0.json")
 DISTANCES = (2.0, 1.5, 2.5)
 
 
-def flown(where: str, distance: float, seed: int, policy: str, plant: str, folder: Path) -> dict:
+def fly_throw(
+    where: str, distance: float, seed: int, policy: str, plant: str, folder: Path
+) -> dict:
     """Fly one throw, through the firmware or on our block; returns its line."""
     params = config.load(
         HilParams,
@@ -76,7 +78,9 @@ def series(args: argparse.Namespace) -> list[dict]:
             for seed in range(args.seeds):
                 if (where, distance, seed) not in done:
                     throws.append(
-                        flown(where, distance, seed, args.policy, args.plant, args.out / args.name)
+                        fly_throw(
+                            where, distance, seed, args.policy, args.plant, args.out / args.name
+                        )
                     )
                     with open(lines, "a") as out:
                         out.write(json.dumps(throws[-1]) + "\n")

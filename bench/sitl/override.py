@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.sitl.direct import opened
+from bench.sitl.direct import open_runner
 from bench.sitl.piloted import Piloted
 from hil.control.loop import Loop
 from hil.control.state_machine import State
@@ -53,7 +53,9 @@ def fly(
     )
     policy = policy or Policy.load(find_policy(params.policy))
     plant = make_motors(params.policy, seed)
-    with opened(program, folder, params, policy, plant, FakeMocapParams(), seed, Piloted) as parts:
+    with open_runner(
+        program, folder, params, policy, plant, FakeMocapParams(), seed, Piloted
+    ) as parts:
         runner, source, clock, fake = parts
         loop = Loop(runner, source, clock, AutoOperator())
         killed = None
@@ -111,7 +113,7 @@ def never(folder: Path) -> Policy:
     return Policy.load(folder / "never.npz")
 
 
-def killed(program: str | Path, folder: Path, state: str) -> dict[str, Any]:
+def fly_until_killed(program: str | Path, folder: Path, state: str) -> dict[str, Any]:
     """Fly until the runner is killed, in hover, or in a throw by the shipped policy."""
     hovers = state != State.THROW
     policy = never(folder) if hovers else None
@@ -129,7 +131,7 @@ def main() -> None:
     args = parser.parse_args()
     print(json.dumps(fly(args.firmware, args.folder / "throw")), flush=True)
     for state in endings.STATES:
-        print(json.dumps(killed(args.firmware, args.folder, state)), flush=True)
+        print(json.dumps(fly_until_killed(args.firmware, args.folder, state)), flush=True)
 
 
 if __name__ == "__main__":

@@ -42,11 +42,11 @@ class Piloted(BetaflightSitl):
     def fly(self) -> None:
         if self.plant.time - self._framed >= FRAME:
             self._framed = self.plant.time
-            self.radio = self._flown_by_hand()
+            self.radio = self._fly_by_hand()
             self._transmitter.send(RADIO.pack(self.plant.time, *self.radio))
         super().fly()
 
-    def _flown_by_hand(self) -> list[int]:
+    def _fly_by_hand(self) -> list[int]:
         channels = [LOW] * 16
         thrust, *rates = self.hold(self._place) if self.armed else np.zeros(4)
         low = self.params.minimum_us

@@ -7,7 +7,7 @@ the ball; both are off by the noise of a pixel. Numbers are those of the shipped
 
 import numpy as np
 
-from bench.worlds.turns import matrix, sampled, small_turn
+from bench.worlds.turns import matrix, resample, small_turn
 
 SIZE = 640
 FOCAL = 166.6786
@@ -26,18 +26,18 @@ RATE = 50.0
 AROUND = np.linspace(0.0, 2 * np.pi, 360, endpoint=False)
 
 
-def bent(angle: np.ndarray, k1: float) -> np.ndarray:
+def bend(angle: np.ndarray, k1: float) -> np.ndarray:
     """Distance from the centre over the focal length at an angle off the axis."""
     return angle * (1.0 + k1 * angle**2)
 
 
-def imaged(rays: np.ndarray, w) -> tuple[np.ndarray, np.ndarray]:
+def project(rays: np.ndarray, w) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of rays in the camera's frame, shape (..., 3) to (..., 2), and whether the lens and
     the sensor see them.
     """
     level = np.hypot(rays[..., 0], rays[..., 1])
     angle = np.arctan2(level, rays[..., 2])
-    reach = FOCAL * (1.0 + w.camera_focal) * bent(angle, w.camera_k1) / np.maximum(level, 1e-12)
+    reach = FOCAL * (1.0 + w.camera_focal) * bend(angle, w.camera_k1) / np.maximum(level, 1e-12)
     pixels = reach[..., None] * rays[..., :2] + CENTRE + w.camera_centre
     inside = (angle <= HALF_VIEW) & np.all((pixels > -0.5) & (pixels < SIZE - 0.5), axis=-1)
     return pixels, inside
@@ -67,16 +67,16 @@ def marks(
     Returns:
         Points, shape (T, 8, 2), and which of them are visible, shape (T, 8).
     """
-    q = sampled(flight.time, flight.quat[lane], time)
+    q = resample(flight.time, flight.quat[lane], time)
     body = matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
-    pos, ball = (sampled(flight.time, series[lane], time) for series in (flight.pos, flight.ball))
+    pos, ball = (resample(flight.time, series[lane], time) for series in (flight.pos, flight.ball))
     lens = pos + body @ (LENS + w.camera_place)
     turned = LOOKING_DOWN @ small_turn(w.camera_turn).T
     to_camera = np.einsum("ij,tkj->tik", turned, body)
     corners = np.einsum("tij,tkj->tki", to_camera, goal * [1.0, 1.0, 0.0] + SQUARE - lens[:, None])
-    points, visible = imaged(corners, w)
+    points, visible = project(corners, w)
     ring = outline(np.einsum("tij,tj->ti", to_camera, ball - lens), BALL * (1.0 + w.camera_ball))
-    around, whole = imaged(ring, w)
+    around, whole = project(ring, w)
     left, top = around.min(1).T
     right, bottom = around.max(1).T
     u = 0.5 * (left + right)
@@ -87,7 +87,7 @@ def marks(
     )
 
 
-def looked(
+def record_camera(
     flight,
     lane: int,
     goal: np.ndarray,

@@ -11,7 +11,7 @@ import numpy as np
 from bench.worlds.fly import fly
 from bench.worlds.numbers import hide
 from bench.worlds.pilot import Tracker
-from bench.worlds.world import GUSTS, Recipe, recorded, world_of
+from bench.worlds.world import GUSTS, Recipe, build_world, record_flights
 
 ALONE = 1.5
 """Before a flight without payload: it drops, and the vehicle comes to rest [s]."""
@@ -108,7 +108,7 @@ class Follower(Tracker):
 
 def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
     """Fly tables in a world, all of them in step, and record each as
-    :func:`bench.worlds.world.recorded` does.
+    :func:`bench.worlds.world.record_flights` does.
 
     A flight without payload drops it first; its record begins afterwards and shows neither payload
     nor release."""
@@ -117,7 +117,7 @@ def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
     pilot = Follower(tables, known.mass, known.ball_mass + known.rope_mass, rng)
     flown = fly(
         recipe.plant,
-        [world_of(recipe)] * len(tables),
+        [build_world(recipe)] * len(tables),
         pilot.command,
         tables,
         max(t.seconds for t in tables),
@@ -125,7 +125,7 @@ def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
         int(rng.integers(2**31)),
         rng.uniform(0.0, 0.4, len(tables)),
     )
-    out = recorded(replace(recipe, seed=int(rng.integers(2**31))), [flown])
+    out = record_flights(replace(recipe, seed=int(rng.integers(2**31))), [flown])
     return [_trimmed(record, table) for record, table in zip(out, tables)]
 
 

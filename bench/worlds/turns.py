@@ -43,6 +43,6 @@ def quaternion(r: np.ndarray) -> np.ndarray:
     )
 
 
-def sampled(time: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
+def resample(time: np.ndarray, series: np.ndarray, at: np.ndarray) -> np.ndarray:
     """A series of shape (T, n) at other times, linear between milliseconds."""
     return np.stack([np.interp(at, time, column) for column in series.T], -1)

@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 from scipy.signal import butter, lfilter
 
-from bench.worlds.camera import looked
+from bench.worlds.camera import record_camera
 from bench.worlds.fly import Flights, fly
 from bench.worlds.numbers import CHANGES, LANDING_HEIGHT, hide
 from bench.worlds.pilot import PERIOD, FreeFlight, Throw, Tracker
-from bench.worlds.turns import matrix, quaternion, sampled, small_turn
+from bench.worlds.turns import matrix, quaternion, resample, small_turn
 
 FLOORS = {
     "rope_length": 5e-4,
@@ -155,7 +155,7 @@ def dust_of(recipe: Recipe) -> dict[str, float]:
     }
 
 
-def world_of(recipe: Recipe):
+def build_world(recipe: Recipe):
     """Numbers of the recipe's world. The string's ball is a point."""
     world = hide(recipe.effects | dust_of(recipe))
     if recipe.plant == "string":
@@ -174,7 +174,7 @@ def worlds_of(recipe: Recipe, first: int, count: int) -> list:
             name: float(deviation * rng.standard_normal())
             for name, deviation in recipe.varies.items()
         }
-        world = world_of(recipe)
+        world = build_world(recipe)
         for name, size in sizes.items():
             CHANGES[name](world, size)
         out.append(world)
@@ -240,32 +240,32 @@ def fly_recipe(recipe: Recipe) -> list[Flights]:
     return out
 
 
-def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
+def record_flights(recipe: Recipe, flights: list[Flights]) -> list[dict]:
     """Recordings of each flight: plain arrays, SI units, quaternions wxyz; NaN where a frame was
     lost.
 
     Keys: ``time``, ``pos``, ``quat``, ``ball`` (200 Hz); ``sent_time``, ``sent`` (N, rad/s),
     ``volt`` [V]; ``release`` (its time or None); ``truth_landing``, which no log holds. With a
-    camera, also the recordings of :func:`bench.worlds.camera.looked`."""
+    camera, also the recordings of :func:`bench.worlds.camera.record_camera`."""
     rng, eye, meter = (
         np.random.default_rng(seed)
         for seed in (recipe.seed + 3, [recipe.seed, 4], [recipe.seed, 5])
     )
-    w = world_of(recipe)
+    w = build_world(recipe)
     tilt = small_turn(w.frame_tilt)
     turn = small_turn(w.marker_turn)
     out = []
     for f in flights:
         for e in range(len(f.pos)):
             t = np.arange(0.02, f.time[-1] - 1e-9, 1 / RATE)
-            q = sampled(f.time, f.quat[e], t - w.quad_stamp)
+            q = resample(f.time, f.quat[e], t - w.quad_stamp)
             rot = matrix(q / np.linalg.norm(q, axis=1, keepdims=True))
             pos = (
                 (1 + w.frame_scale)
-                * (sampled(f.time, f.pos[e], t - w.quad_stamp) + rot @ w.marker_off)
+                * (resample(f.time, f.pos[e], t - w.quad_stamp) + rot @ w.marker_off)
                 @ tilt.T
             )
-            ball = (1 + w.frame_scale) * sampled(f.time, f.ball[e], t - w.ball_stamp) @ tilt.T
+            ball = (1 + w.frame_scale) * resample(f.time, f.ball[e], t - w.ball_stamp) @ tilt.T
             noise = small_turn(
                 recipe.noise * NOISE["att"] * sensor_noise(rng, recipe.colour, (len(t), 3))
             )
@@ -304,7 +304,7 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
             )
             if recipe.camera:
                 aim = (f.ball[e][down[0]] if len(down) else np.zeros(3)) + eye.uniform(-0.5, 0.5, 3)
-                out[-1] |= looked(
+                out[-1] |= record_camera(
                     f, e, aim * [1.0, 1.0, 0.0], landed, w, recipe.noise, recipe.dropouts, eye
                 )
     return out

@@ -23,18 +23,18 @@ TEXT = re.compile(r'^\w+ = (?:".*"|\[(?:"[^"]*"(?:, )?)*\])$|^prior_sd = [-\d.e]
 HAS_NUMBER = re.compile(r"(?<![\w.])[-+]?\d")
 
 
-def named(path: Path) -> str:
+def load_named(path: Path) -> str:
     return str(path.relative_to(config.configs_root()))
 
 
-@mark.parametrize("path", FILES, ids=named)
+@mark.parametrize("path", FILES, ids=load_named)
 def test_fills_its_schema(path):
     schema = kinds.schema_of(path.parent.name, path.stem)
     loaded = config.load(schema, path)
     assert config.loads(schema, config.dumps(loaded)) == loaded
 
 
-def uncommented(text: str) -> list[str]:
+def find_uncommented(text: str) -> list[str]:
     """Return the lines with a number and no comment beside them, or above them since the last table
     or empty line.
     """
@@ -55,20 +55,20 @@ def uncommented(text: str) -> list[str]:
     return wrong
 
 
-@mark.parametrize("path", [path for path in FILES if path.parent.name in COMMENTED], ids=named)
+@mark.parametrize("path", [path for path in FILES if path.parent.name in COMMENTED], ids=load_named)
 def test_every_number_says_where_it_comes_from(path):
     text = path.read_text(encoding="utf-8")
-    assert not uncommented(TEXT.sub("", text) if path.parent.name == "effects" else text)
+    assert not find_uncommented(TEXT.sub("", text) if path.parent.name == "effects" else text)
 
 
 def test_the_check_itself():
-    assert uncommented(
+    assert find_uncommented(
         TEXT.sub("", 'source = "of 2012"\nprior_sd = 1e-3\nof = ["x_1", "y"]\nfloor = 2.0')
     ) == ["floor = 2.0"]
-    assert uncommented("a = 1\nb = 2  # because\n") == ["a = 1"]
-    assert uncommented("# because\na = 1\nb = [2, 3]\n") == []
-    assert uncommented("# because\na = 1\n\nb = 2\n[t]\nc = 3") == ["b = 2", "c = 3"]
-    assert uncommented('a = "x1"\nb = true') == []
+    assert find_uncommented("a = 1\nb = 2  # because\n") == ["a = 1"]
+    assert find_uncommented("# because\na = 1\nb = [2, 3]\n") == []
+    assert find_uncommented("# because\na = 1\n\nb = 2\n[t]\nc = 3") == ["b = 2", "c = 3"]
+    assert find_uncommented('a = "x1"\nb = true') == []
 
 
 def test_the_catalogue_reads_every_file_of_effects_and_every_number_of_a_change_exists():

@@ -11,7 +11,7 @@ from hil.control.recording.playback import replay
 from hil.control.recording.record import lines
 from hil.poses.pose import Pose
 from tests.hil_flight import TICK
-from tests.hil_runs import record_run, saved_policy
+from tests.hil_runs import record_run, save_policy
 from tests.loopback.wire import QUICK
 
 
@@ -56,7 +56,7 @@ def test_a_run_whose_policy_failed_replays(tmp_path):
     """
     record_run(
         tmp_path / "a",
-        saved_policy(tmp_path, (1.0, 1.0, -1.0, 1.0, -1.0)),
+        save_policy(tmp_path, (1.0, 1.0, -1.0, 1.0, -1.0)),
         *QUICK,
         seconds=3.0,
         close=False,

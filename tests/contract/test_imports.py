@@ -65,7 +65,7 @@ def imports_of(path: Path, root: Path) -> set[str]:
 
 
 @cache
-def imported(path: Path) -> set[str]:
+def find_imports(path: Path) -> set[str]:
     return imports_of(path, ROOT)
 
 
@@ -100,7 +100,7 @@ def test_a_place_imports_what_it_may(place, packages, allowed):
     wrong = [
         f"{path.relative_to(ROOT)} imports {name}"
         for path in sources(place)
-        for name in imported(path)
+        for name in find_imports(path)
         if begins(name, packages) and not begins(name, allowed)
     ]
     assert not wrong

@@ -24,7 +24,7 @@ thousands of those [m].
 """
 
 
-def driven(sim: HybridSim) -> dict[str, np.ndarray]:
+def drive(sim: HybridSim) -> dict[str, np.ndarray]:
     for k, command in enumerate(random_commands(0, STEPS, COUNT)):
         sim.set_command(command, (np.arange(COUNT) % 2) * (k == 5))
         sim.step()
@@ -55,6 +55,6 @@ def test_graph_equals_launches():
 
 def test_cuda_agrees_with_the_cpu():
     plant = replace(paper_plant(), sim=numerics(precision="float64"))
-    on_cuda, on_cpu = (driven(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
+    on_cuda, on_cpu = (drive(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
     for name in ("pos_w", "payload_pos_w", "landing_w"):
         assert_allclose(on_cuda[name], on_cpu[name], atol=SAME, err_msg=name)

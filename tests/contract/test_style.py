@@ -79,7 +79,7 @@ def upward(arrows: Mapping[str, set[str]], order: list[str]) -> list[str]:
     ]
 
 
-def long_functions(text: str) -> list[tuple[str, int]]:
+def find_long_functions(text: str) -> list[tuple[str, int]]:
     """Return the name and the lines of each function that is too long and builds no kernel."""
 
     def warp(node: ast.AST) -> bool:
@@ -98,19 +98,19 @@ def long_functions(text: str) -> list[tuple[str, int]]:
     return [function for function in lines if function[1] > LONGEST]
 
 
-def left(entry: Path) -> bool:
+def is_leftover(entry: Path) -> bool:
     """Whether a folder holds nothing but what an interpreter left there."""
     return entry.is_dir() and all(
         path.is_dir() or "__pycache__" in path.parts for path in entry.rglob("*")
     )
 
 
-def crowded(root: Path, packages: Iterable[str] = PACKAGES) -> list[tuple[str, int]]:
+def find_crowded(root: Path, packages: Iterable[str] = PACKAGES) -> list[tuple[str, int]]:
     """Return each folder of modules that has too many entries."""
     folders = {path.parent for path in modules(root, packages).values()}
     counts = {
         folder: sum(
-            entry.name not in ASIDE and not entry.name.startswith(".") and not left(entry)
+            entry.name not in ASIDE and not entry.name.startswith(".") and not is_leftover(entry)
             for entry in folder.iterdir()
         )
         for folder in folders
@@ -134,12 +134,12 @@ def offences() -> set[str]:
     long = {
         f"long: {name}.{function}"
         for name, path in modules(ROOT, PACKAGES).items()
-        for function, _ in long_functions(path.read_text(encoding="utf-8"))
+        for function, _ in find_long_functions(path.read_text(encoding="utf-8"))
     }
     return {
         *(f"circle: {name}" for name in circle(arrows())),
         *(f"upward: {arrow}" for arrow in upward(arrows(), ORDER)),
-        *(f"crowded: {folder}" for folder, _ in crowded(ROOT)),
+        *(f"crowded: {folder}" for folder, _ in find_crowded(ROOT)),
         *long,
     }
 
@@ -217,14 +217,14 @@ def test_the_rooms_are_read_in_their_order():
 
 def test_a_long_function_is_caught_unless_it_builds_a_kernel():
     body = "    x = 1\n" * (LONGEST - 1)
-    assert long_functions(f"def f():\n{body}") == []
-    assert long_functions(f"def f():\n{body}    y = 2\n") == [("f", LONGEST + 1)]
-    assert long_functions(
+    assert find_long_functions(f"def f():\n{body}") == []
+    assert find_long_functions(f"def f():\n{body}    y = 2\n") == [("f", LONGEST + 1)]
+    assert find_long_functions(
         f"class A:\n    async def f(self):\n{body.replace('    ', '        ')}        y = 2\n"
     ) == [("f", LONGEST + 1)]
     for of in ("wp.func", "wp.kernel", "wp.kernel(enable_backward=False)", "unique_kernel"):
-        assert long_functions(f"def f():\n    @{of}\n    def g():\n        pass\n{body}") == []
-    assert long_functions(f"def f():\n    @cache\n    def g():\n        pass\n{body}") == [
+        assert find_long_functions(f"def f():\n    @{of}\n    def g():\n        pass\n{body}") == []
+    assert find_long_functions(f"def f():\n    @cache\n    def g():\n        pass\n{body}") == [
         ("f", LONGEST + 3)
     ]
 
@@ -233,6 +233,6 @@ def test_a_crowded_folder_is_caught(house, tmp_path):
     for i in range(MOST - 1):
         house(f"p.low.m{i}")
     (tmp_path / "p" / "low" / "README.md").touch()
-    assert crowded(tmp_path, ["p"]) == []
+    assert find_crowded(tmp_path, ["p"]) == []
     house("p.low.more")
-    assert crowded(tmp_path, ["p"]) == [("p/low", MOST + 1)]
+    assert find_crowded(tmp_path, ["p"]) == [("p/low", MOST + 1)]

@@ -32,7 +32,7 @@ EXEMPT = {"tests/contract/test_text.py", "tests/unit/on_visthrow/test_provenance
 """This file holds the pattern; the other one tests that such paths are left out."""
 
 
-def tracked() -> list[Path]:
+def list_tracked() -> list[Path]:
     """Return the tracked files; in a copy without history, every file of the source folders."""
     listed = subprocess.run(
         ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True
@@ -48,7 +48,7 @@ def tracked() -> list[Path]:
     return [path for path in files if path.is_file() and path.suffix not in BINARY]
 
 
-FILES = tracked()
+FILES = list_tracked()
 
 
 def test_no_machine_paths():

@@ -16,7 +16,7 @@ SPOILT = {
     "always NO EFFECT": lambda kinds, real: finding.blind,
     "always the most common name": lambda kinds, real: finding.always(most_common(kinds)),
     "reads file names": lambda kinds, real: finding.reader_of_file_names,
-    "takes two effects for each other": lambda kinds, real: finding.exchanged(
+    "takes two effects for each other": lambda kinds, real: finding.exchange_effects(
         kinds[0].hidden[0], next(x for x in finding.SINGLE if x != kinds[0].hidden[0]), real
     ),
 }
@@ -39,7 +39,7 @@ def suite():
 @fixture(scope="module")
 def real():
     """The tool itself, which diagnoses the same logs only once."""
-    return finding.once(finding.explain)
+    return finding.cache_answers(finding.explain)
 
 
 def test_what_is_hidden_is_found(suite, real):

@@ -34,15 +34,16 @@ TURNING = replace(
 )
 
 
-def slung() -> NumericModel:
+def fly_slung() -> NumericModel:
     """A quadrotor with a ball on a cable."""
-    world = foreign.drawn(0)[2]
+    world = foreign.draw_world(0)[2]
     return FlyerModel(
-        [foreign.flown(world, np.random.default_rng(0), 4.0)], foreign.known("crazyflie")
+        [foreign.fly_lissajous(world, np.random.default_rng(0), 4.0)],
+        foreign.describe_vehicle("crazyflie"),
     )
 
 
-def turning() -> NumericModel:
+def fly_turning() -> NumericModel:
     """A quadrotor whose rates are simulated."""
     log = fly(4.0, drag=0.02)
     time, quat = log["quat_wb"].samples()
@@ -55,8 +56,8 @@ def turning() -> NumericModel:
 
 MODELS = {
     "ball": lambda: BallModel([ball_log(drag=0.04, spin=(0.0, 0.0, 0.3), seed=1)], BALL),
-    "flyer": turning,
-    "slung": slung,
+    "flyer": fly_turning,
+    "slung": fly_slung,
     "pendulum": lambda: small.model_of("pendulum", small.logs_of("pendulum", "", 3, 1)),
     "trim": lambda: small.model_of("trim", small.logs_of("trim", "", 3, 1)),
 }
@@ -75,7 +76,7 @@ ACTING = [
 
 
 @cache
-def undisturbed(kind: str) -> tuple[NumericModel, list[Window]]:
+def load_undisturbed(kind: str) -> tuple[NumericModel, list[Window]]:
     """Return a model and its windows without any effect."""
     model = MODELS[kind]()
     return model, model.windows({})
@@ -88,7 +89,7 @@ def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
 
     The kind's other laws stand beside it with a coefficient of 0, so that one kernel serves all.
     """
-    model, windows = undisturbed(kind)
+    model, windows = load_undisturbed(kind)
     of_kind = [other for its, other in ACTING if its == kind]
     laws = [other if other is law else replace(other, coefficient=0.0) for other in of_kind]
     term = term_of(law)

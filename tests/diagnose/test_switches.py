@@ -4,7 +4,7 @@ import numpy as np
 from pytest import approx, mark, param
 
 from bench.diagnose.sealed import flight_log, model_of
-from bench.worlds.world import Recipe, fly_recipe, recorded
+from bench.worlds.world import Recipe, fly_recipe, record_flights
 from tests.configs import load_experiment
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import plant_of
@@ -27,7 +27,7 @@ def test_a_missing_block_is_worth_its_whole_size(lacks, name):
     with a theta near 1.
     """
     recipe = Recipe(31, "rod", {}, free=0, throws=2, held=0)
-    logs = [flight_log(r) for r in recorded(recipe, fly_recipe(recipe))]
+    logs = [flight_log(r) for r in record_flights(recipe, fly_recipe(recipe))]
     plant = plant_of(load_experiment("state", [*model_of(recipe), lacks]))
     model = ThrowModel(logs, plant, only=[name])
     throws = [w for w in model.windows({}) if w.phase == "throw"]

@@ -15,7 +15,7 @@ from bench.processes import free_port
 from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
 from tests.commands import start
-from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
+from tests.fuzz import EACH, SEEDS, any_message, mutate, noise
 from tests.hil_flight import AT_ONCE, AutoOperator
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, QUICK, cut, peers
@@ -36,7 +36,7 @@ def flood(count: int, kind: str, seed: int) -> None:
         fake.step()
     source.poll(clock.now())
     good = [any_message(rng) for _ in range(200)]
-    makers = (any_message, any_message, any_message, lambda rng: mutated(rng, good), noise)
+    makers = (any_message, any_message, any_message, lambda rng: mutate(rng, good), noise)
     sent = 0
     while sent < count:
         inbox.extend(makers[rng.integers(len(makers))](rng) for _ in range(200))
@@ -112,7 +112,7 @@ def forger(rng, signed: bool, captured: list[bytes]):
     return make
 
 
-def flown(seed: int, count: int, kind: str, signed: bool):
+def fly_hostile(seed: int, count: int, kind: str, signed: bool):
     """A throw in lock step beside forged packets: the decisions, the commands that the vehicle
     accepted, the refusals.
     """
@@ -146,15 +146,15 @@ def flown(seed: int, count: int, kind: str, signed: bool):
     return decisions, summary, fake, source.links[0].roster, left[0], runner
 
 
-def unmoved(seed: int, count: int) -> None:
+def assert_unmoved(seed: int, count: int) -> None:
     """Forged packets, over as many throws as needed, change no bit of the decisions or of the
     commands that the vehicle accepts.
     """
     kind, signed = ("ardupilot", "px4")[seed % 2], seed % 4 >= 2
-    alone, _, plain, _, _, _ = flown(seed, 0, kind, signed)
+    alone, _, plain, _, _, _ = fly_hostile(seed, 0, kind, signed)
     left = count
     for part in range(MOST_THROWS):
-        decisions, summary, fake, roster, rest, runner = flown(
+        decisions, summary, fake, roster, rest, runner = fly_hostile(
             1000 * part + seed, left, kind, signed
         )
         assert decisions == alone
@@ -174,7 +174,7 @@ def unmoved(seed: int, count: int) -> None:
 
 @mark.parametrize("seed", [0, 3])
 def test_forged_packets_change_no_bit_of_a_throw(seed):
-    unmoved(seed, 6_000)
+    assert_unmoved(seed, 6_000)
 
 
 READY = 8.0
@@ -192,7 +192,7 @@ def test_a_million_messages_command_nothing(seed):
 @mark.slow
 @mark.parametrize("seed", SEEDS)
 def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
-    unmoved(seed, EACH)
+    assert_unmoved(seed, EACH)
 
 
 def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):

@@ -33,7 +33,7 @@ ENDS = {"stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quate
 FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double"}
 
 
-def spoiled(name: str):
+def run_spoiled(name: str):
     """A run in which a fault happens in mid throw: runner, fake, and the first decision of each
     state.
     """
@@ -52,7 +52,7 @@ def spoiled(name: str):
 
 @mark.parametrize("name", sorted(FAULTS))
 def test_a_fault_in_mid_throw(name):
-    runner, fake, decisions = spoiled(name)
+    runner, fake, decisions = run_spoiled(name)
     assert when(decisions, "throw") < START - 0.2, "the throw goes on when the fault begins"
     after = [(state, reason) for state, reason, time in decisions if time > START]
     if name in ENDS:

@@ -38,7 +38,7 @@ HERE = ("127.0.0.1", 1)
 """Address of the other end."""
 
 
-def wired(message, system=1, component=1):
+def pass_wire(message, system=1, component=1):
     """A message as it comes out of the wire, with its sender."""
     (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
     return got

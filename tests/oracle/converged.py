@@ -37,7 +37,7 @@ def _places(
     return data.qpos[:3].copy(), ball, ball_vel
 
 
-def converged(
+def run_converged(
     scene: Scene,
     step: float = CONVERGED_STEP,
     times: np.ndarray | None = None,

@@ -12,7 +12,7 @@ from numpy.linalg import norm
 from pytest import mark
 
 from sim.kernels.state import NONFINITE
-from tests.oracle.converged import OracleRun, converged
+from tests.oracle.converged import OracleRun, run_converged
 from tests.plants import SCENES
 from tests.scenes import Scene, load_scene
 from tests.simulators import Flight, fly
@@ -39,7 +39,7 @@ rad/s when taut.
 
 @lru_cache
 def oracle(scene: Scene) -> OracleRun:
-    return converged(scene)
+    return run_converged(scene)
 
 
 def errors(flight: Flight, run: OracleRun) -> tuple[float, float, float]:
@@ -54,7 +54,7 @@ def errors(flight: Flight, run: OracleRun) -> tuple[float, float, float]:
 @mark.parametrize("name", ["hard_throw", "whip"])
 def test_the_oracle_has_converged(name):
     scene = load_scene(SCENES / f"{name}.toml")
-    fine, coarse = oracle(scene), converged(scene, 40e-6)
+    fine, coarse = oracle(scene), run_converged(scene, 40e-6)
     assert np.abs(fine.ball_pos_w - coarse.ball_pos_w).max() < CONVERGED
     assert np.abs(fine.pos_w - coarse.pos_w).max() < CONVERGED
 
@@ -106,7 +106,7 @@ def coarse_rope(segments: int) -> Scene:
 def test_order_of_the_step(segments):
     """Against MuJoCo, and by three steps of our own, which needs no other code."""
     scene = coarse_rope(segments)
-    run = converged(scene, 40e-6)
+    run = run_converged(scene, 40e-6)
     flights = [fly(scene, RESOLVED[segments] / k, "float64") for k in (1, 2, 4)]
     for part in range(2):
         against = [errors(flight, run)[part] for flight in flights]

@@ -244,7 +244,7 @@ def test_a_rope_that_gives_is_a_spring(steps):
     plant = changed(plant, grown | rope)
     tilt = np.array([np.sin(angle), 0.0, -np.cos(angle)])
 
-    def hung(give: float) -> np.ndarray:
+    def hang(give: float) -> np.ndarray:
         sim = HybridSim(changed(plant, {"rope.compliance": give}), 1, extensions=EVERYTHING)
         sim.place(
             pos_w=np.array([[0.0, 0.0, 5.0]]),
@@ -257,7 +257,7 @@ def test_a_rope_that_gives_is_a_spring(steps):
 
     give, mass, length = 2e-3, plant.rope.payload_mass, plant.rope.length
     expected = [spring_pendulum(g, mass, length, angle, 0.02 * steps) for g in (give, 1e-6)]
-    change = hung(give) - hung(0.0)
+    change = hang(give) - hang(0.0)
     assert norm(change) > 5e-4
     assert_allclose(change, expected[0] - expected[1], atol=0.12 * norm(change))  # the mount drifts
 

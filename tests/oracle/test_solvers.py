@@ -42,49 +42,49 @@ SOLVERS = [("exchanged_chain", 0.002, 0.002), ("mujoco_warp", 0.0005, 0.001), PH
 is of first order. A separation within a substep frees the vehicle at its end only."""
 
 
-def on(plant: PlantParams, solver: str, substep: float) -> PlantParams:
+def use_solver(plant: PlantParams, solver: str, substep: float) -> PlantParams:
     """The plant with its bodies in a solver."""
     numerics = replace(plant.sim, solver=solver, substep=substep)
     return replace(plant, sim=numerics)
 
 
 @lru_cache
-def converged() -> Flight:
+def run_converged() -> Flight:
     """The fused chain's hard throw at a fine step."""
     return fly(SCENE, 2e-4, "float32", 0.02, "chain")
 
 
-def off_converged(solver: str, substep: float) -> float:
+def measure_distance(solver: str, substep: float) -> float:
     """How far a solver ends the hard throw from the fused chain's converged run [m]."""
-    end, truth = fly(SCENE, substep, "float32", 0.02, solver), converged()
+    end, truth = fly(SCENE, substep, "float32", 0.02, solver), run_converged()
     ball, vehicle = norm(end.ball_pos_w - truth.ball_pos_w), norm(end.pos_w - truth.pos_w)
     return max(float(ball), float(vehicle))
 
 
 def test_the_exchange_costs_the_chain_no_accuracy():
     """Measured 0.15 mm of the ball and 0.22 mm of the vehicle, fused and exchanged alike."""
-    exchanged, fused = (off_converged(name, 2e-3) for name in ("exchanged_chain", "chain"))
+    exchanged, fused = (measure_distance(name, 2e-3) for name in ("exchanged_chain", "chain"))
     assert exchanged == approx(fused, abs=2e-5)
     assert exchanged < 4e-4
 
 
 def test_mujoco_ends_the_hard_throw_at_the_same_place():
     """RK4 has converged at 0.5 ms; measured 0.024 mm."""
-    assert off_converged("mujoco_warp", 5e-4) < 1e-4
+    assert measure_distance("mujoco_warp", 5e-4) < 1e-4
 
 
 @needs_physx
 def test_physx_converges_onto_the_chain():
     """First order in its step; measured 8.1 and 2.0 mm."""
-    coarse, fine = (off_converged("physx", step) for step in (2e-3, 5e-4))
+    coarse, fine = (measure_distance("physx", step) for step in (2e-3, 5e-4))
     assert coarse < 0.01
     assert coarse / fine == approx(4.0, rel=0.15)
 
 
-def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> HybridSim:
+def fly_random(solver: str, substep: float, count: int = 12, device: str = "cpu") -> HybridSim:
     """Random vehicles and ropes, a second of drawn commands, and releases on the way."""
     experiment = load_experiment("state")
-    plant = on(plant_of(experiment), solver, substep)
+    plant = use_solver(plant_of(experiment), solver, substep)
     lag = replace(plant.release, lag=0.1113)  # within a substep
     plant, spreads = replace(plant, release=lag), experiment.task.start
     sim = HybridSim(plant, count, device, 4, ropes=tether_lengths(plant.rope, spreads))
@@ -102,7 +102,7 @@ def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> 
 def test_a_solver_flies_and_lets_go_as_the_fused_chain_does(solver, substep, near):
     """Masses, cable lengths, batteries, latch and lag of each environment are the same: a
     twentieth more mass alone would move a vehicle by half a metre."""
-    ours, theirs = flown("chain", 0.002), flown(solver, substep)
+    ours, theirs = fly_random("chain", 0.002), fly_random(solver, substep)
     for name in ("attached", "release_timer", "separation_time", "mass_scale"):
         assert_allclose(theirs.get(name), ours.get(name), atol=1e-5, err_msg=name)
     for name in ("pos_w", "payload_pos_w", "landing_w", "release_pos_w"):
@@ -113,7 +113,7 @@ def test_a_solver_flies_and_lets_go_as_the_fused_chain_does(solver, substep, nea
 @mark.parametrize(("solver", "substep", "near"), [("chain", 0.002, 0.0), *SOLVERS])
 def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
     """One environment stands still, another's velocity is no number: the third flies as ever."""
-    sims = [HybridSim(on(paper_plant(), solver, substep), 3) for _ in range(2)]
+    sims = [HybridSim(use_solver(paper_plant(), solver, substep), 3) for _ in range(2)]
     sick, well = sims
     velocity = np.zeros((3, 3), np.float32)
     velocity[1] = np.nan
@@ -137,7 +137,7 @@ def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
 
 @mark.parametrize(("solver", "substep", "near"), SOLVERS)
 def test_what_stood_still_flies_on_from_the_same_state(solver, substep, near):
-    sim = HybridSim(on(paper_plant(), solver, substep), 2)
+    sim = HybridSim(use_solver(paper_plant(), solver, substep), 2)
     sim.set_command(np.zeros((2, 4)))
     for _ in range(5):
         sim.step(wp.array([1, 0], dtype=wp.int32))
@@ -148,10 +148,10 @@ def test_what_stood_still_flies_on_from_the_same_state(solver, substep, near):
     assert_allclose(sim.get("vel_w")[1], first, atol=1e-3)
 
 
-def hanging(name: str, **vehicle) -> HybridSim:
+def hang_payload(name: str, **vehicle) -> HybridSim:
     """A payload of ``configs/rope`` on a vehicle without blocks, whose command is a wrench."""
     experiment = load_experiment(f"state_{name}")
-    plant = on(plant_of(experiment), "mujoco_warp", 0.00025)
+    plant = use_solver(plant_of(experiment), "mujoco_warp", 0.00025)
     body = replace(plant.vehicle.body, **vehicle)
     controller = plant.vehicle.controller
     strong = replace(controller, max_thrust=max(controller.max_thrust, GRAVITY * body.mass))
@@ -162,7 +162,7 @@ def hanging(name: str, **vehicle) -> HybridSim:
 @mark.parametrize("name", ["box", "two_cables", "rod_gripper"])
 def test_other_payloads_hang_where_the_geometry_says(name):
     """They weigh what they should: a vehicle with a thrust of the total weight stays."""
-    sim = hanging(name)
+    sim = hang_payload(name)
     rope, weight = sim.params.rope, GRAVITY * sim.params.total_mass
     for _ in range(25):
         sim.set_command([[weight, 0.0, 0.0, 0.0]])
@@ -176,7 +176,7 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
     """omega^2 = m g d^2 / (4 I L) for a small turn about the vertical, the mount held still by its
     own inertia.
     """
-    sim = hanging("two_cables", mass=1e4, inertia=(1e2, 1e2, 1e2))
+    sim = hang_payload("two_cables", mass=1e4, inertia=(1e2, 1e2, 1e2))
     solver, turn, angles = sim._exchange.solver, 0.05, []
     solver.qpos.numpy()[0, 10:14] = math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)
     solver._placed(sim._all)
@@ -198,7 +198,7 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
 def test_a_cable_pulls_or_is_slack():
     """Under thrust the cables are as long as they are; a vehicle that is pushed down falls faster
     than the box."""
-    sim = hanging("two_cables")
+    sim = hang_payload("two_cables")
     reach = sim.params.rope.length + sim.params.rope.payload_offset - sim.params.rope.mount[2]
     weight = GRAVITY * sim.params.total_mass
     for thrust, slack in ((1.5 * weight, False), (-0.75 * weight, True)):
@@ -215,7 +215,7 @@ def test_a_solver_flies_on_a_gpu_as_the_fused_chain_does(solver, substep, near):
     if solver == "mujoco_warp":
         importorskip("mujoco_warp")
     ours, theirs = (
-        flown(*build, device="cuda:0") for build in (("chain", 0.002), (solver, substep))
+        fly_random(*build, device="cuda:0") for build in (("chain", 0.002), (solver, substep))
     )
     for name in ("pos_w", "payload_pos_w", "landing_w"):
         assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
@@ -224,15 +224,15 @@ def test_a_solver_flies_on_a_gpu_as_the_fused_chain_does(solver, substep, near):
 def test_what_a_solver_cannot_hold_is_refused():
     box = plant_of(load_experiment("state_box"))
     with raises(ValueError, match=r"payload_sides is .*'mujoco_warp'"):
-        HybridSim(on(box, "chain", 0.002), 1)
+        HybridSim(use_solver(box, "chain", 0.002), 1)
     plant = paper_plant()
     giving = replace(plant.rope, compliance=1e-3)
     with raises(ValueError, match="'exchanged_chain' with compliance"):
-        HybridSim(replace(on(plant, "exchanged_chain", 0.002), rope=giving), 1)
+        HybridSim(replace(use_solver(plant, "exchanged_chain", 0.002), rope=giving), 1)
     in_joint = (LawParams("rope joint", (), "joint_rate", 1e-3),)
     with raises(ValueError, match="law on the rope's joint"):
-        HybridSim(replace(on(plant, "exchanged_chain", 0.002), laws=in_joint), 1)
-    exact = on(plant, "mujoco_warp", 0.002)
+        HybridSim(replace(use_solver(plant, "exchanged_chain", 0.002), laws=in_joint), 1)
+    exact = use_solver(plant, "mujoco_warp", 0.002)
     exact = replace(exact, sim=replace(exact.sim, precision="float64"))
     with raises(ValueError, match="precision 'float64'; expected 'float32'"):
         HybridSim(exact, 1)
@@ -283,10 +283,10 @@ def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
     direction = np.tile([0.0, math.sin(tilt), -math.cos(tilt)], (1, segments, 1))
     rate = np.tile([6.0, 0.0, 0.0], (1, segments, 1))
     level = np.array([[0.0, 0.0, 0.0, 1.0]])
-    exact = changed(on(plant, "chain", 5e-4), {"sim.precision": "float64"})
+    exact = changed(use_solver(plant, "chain", 5e-4), {"sim.precision": "float64"})
     chain = HybridSim(exact, 1, extensions=EVERYTHING)
     velocities = []
-    for sim in (chain, HybridSim(on(plant, "mujoco_warp", 5e-4), 1)):
+    for sim in (chain, HybridSim(use_solver(plant, "mujoco_warp", 5e-4), 1)):
         sim.place(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)), direction, rate)
         for _ in range(5):
             sim.step()

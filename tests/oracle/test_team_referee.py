@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from pytest import mark
 
-from tests.physics.test_team import around, commands, hung, plant
+from tests.physics.test_team import around, commands, hang_level, plant
 from visthrow.cooperative.referee import MujocoTeam
 
 LOAD = 5e-4
@@ -13,7 +13,7 @@ LOAD = 5e-4
 
 @mark.parametrize("team", [2, 3])
 def test_the_load_and_its_vehicles_fly_as_on_mujoco(team):
-    sims = [hung(plant(), around(team), **options) for options in ({}, {"build": MujocoTeam})]
+    sims = [hang_level(plant(), around(team), **options) for options in ({}, {"build": MujocoTeam})]
     for k, command in enumerate(commands(25, team)):
         command[1, 2] *= 0.7
         for sim in sims:

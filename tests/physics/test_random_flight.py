@@ -30,7 +30,7 @@ def experiment() -> Experiment:
     return load_experiment("state")
 
 
-def started(
+def start_randomised(
     count: int, seed: int, plant: PlantParams | None = None, extensions=frozenset()
 ) -> HybridSim:
     """Randomised as in training."""
@@ -45,7 +45,7 @@ def started(
 def test_hardly_a_failed_state_without_terminations():
     """Episodes of a second, by full-range commands."""
     count, start = 400, experiment().task.start
-    sim, failed, fallbacks = started(count, 2), 0, 0
+    sim, failed, fallbacks = start_randomised(count, 2), 0, 0
     for episode in np.split(random_commands(2, 100, count), 2):
         bad = np.zeros(count, dtype=bool)
         for command in episode:
@@ -64,7 +64,7 @@ def segment_rates(substep: float, precision: str, count: int, seed: int) -> np.n
     """Rates of all rods over the first 0.2 s [1/s], shape (T, E, L, 3)."""
     plant = replace(plant_of(experiment()), sim=numerics(substep, precision))
     extensions = EVERYTHING if precision == "float64" else frozenset()
-    sim, rows = started(count, seed, plant, extensions), []
+    sim, rows = start_randomised(count, seed, plant, extensions), []
     for command in random_commands(seed, 10, count):
         sim.set_command(command)
         sim.step()

@@ -16,7 +16,7 @@ def vehicle():
     return paper_plant().vehicle
 
 
-def mixed(vehicle, collective: float, torque: tuple[float, float, float]):
+def mix(vehicle, collective: float, torque: tuple[float, float, float]):
     """Thrusts of the rotors, what they do about roll, pitch and yaw, and the mixer's two shares."""
     rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
     thrusts, tilt_share, yaw_share = vehicle_blocks.mixer(
@@ -29,7 +29,7 @@ def mixed(vehicle, collective: float, torque: tuple[float, float, float]):
 
 def test_mixer_delivers_what_fits(vehicle):
     torque = (0.02, -0.03, 0.004)
-    thrusts, delivered, *shares = mixed(vehicle, 4.0, torque)
+    thrusts, delivered, *shares = mix(vehicle, 4.0, torque)
     assert_allclose(delivered, torque, atol=EXACT)
     assert abs(thrusts.sum() - 4.0) < EXACT
     assert shares == [1.0, 1.0]
@@ -37,7 +37,7 @@ def test_mixer_delivers_what_fits(vehicle):
 
 @mark.parametrize("torque", [(0.0, 0.0, 0.1), (0.3, 0.1, 0.3), (0.05, 0.15, -0.1)])
 def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
-    thrusts, (roll, pitch, yaw), tilt_share, yaw_share = mixed(vehicle, 2.0, torque)
+    thrusts, (roll, pitch, yaw), tilt_share, yaw_share = mix(vehicle, 2.0, torque)
     assert thrusts.min() > 0.03 - EXACT
     assert thrusts.max() < 3.5 + EXACT
     assert_allclose(roll * torque[1], pitch * torque[0], atol=EXACT)

@@ -15,7 +15,7 @@ STILL = np.zeros((1, 3))
 HIGH = np.array([[0.0, 0.0, 1.5]])
 
 
-def swinging(plant, step):
+def start_swinging(plant, step):
     """A plant whose rope starts at 0.5 rad and swings down."""
     reference = ReferencePlant(plant, step=step)
     direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (1, plant.rope.segments, 1))
@@ -29,7 +29,7 @@ def test_steps_of_the_plant_have_converged():
     """
     ends = []
     for step in (5e-4, 2.5e-4):
-        reference = swinging(paper_plant(), step)
+        reference = start_swinging(paper_plant(), step)
         for k in range(7):
             reference.step(np.array([[3.5, 1.0, -2.0 + 0.6 * k, 0.5]]), True)
         ends.append(reference.state)
@@ -59,7 +59,7 @@ def test_landing_equals_the_closed_form_without_rope_mass(step):
     rope = replace(plain.rope, segments=2, rope_mass=1e-5, joint_damping=0.0)
     release = replace(plain.release, lag=0.04)
     plant = replace(plain, rope=rope, release=release)
-    reference = swinging(plant, step)
+    reference = start_swinging(plant, step)
     command = np.array([[2.6, 0.0, 0.0, 0.0]])
     for k in range(10):
         reference.step(command, k == 8)

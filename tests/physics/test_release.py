@@ -19,7 +19,7 @@ def plant(lag: float) -> PlantParams:
     return changed(paper_plant(), {"release.lag": lag})
 
 
-def thrown(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict]:
+def throw(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict]:
     """Outputs of every step; the release is commanded at one step only."""
     rows = []
     for k, command in enumerate(commands):
@@ -44,7 +44,7 @@ def test_the_latch_keeps_and_the_lag_is_exact(lag):
     """
     release_step, count = 3, 2
     sim = HybridSim(plant(lag), count)
-    rows = thrown(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), release_step)
+    rows = throw(sim, np.tile([3.0, 0.5, 0.0, 0.0], (14, count, 1)), release_step)
     times = [k for k, row in enumerate(rows) if np.any(row["separated"])]
     assert len(times) == 1
     (step,) = times

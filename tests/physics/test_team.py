@@ -39,7 +39,7 @@ def around(team: int) -> np.ndarray:
     return np.stack([side * np.cos(angle), side * np.sin(angle), down], -1)[None]
 
 
-def hung(params: PlantParams, directions: np.ndarray, **options) -> TeamSim:
+def hang_level(params: PlantParams, directions: np.ndarray, **options) -> TeamSim:
     """Level vehicles where straight cables lead from the load to them, all moving alike."""
     rope, team = params.rope, directions.shape[1]
     sim = TeamSim(params, 1, team, threads=1, **options)
@@ -61,7 +61,7 @@ def commands(steps: int, rows: int) -> np.ndarray:
 
 def test_one_vehicle_is_the_fused_chain():
     params = plant()
-    team, single = hung(params, np.array([[[0.0, 0.0, -1.0]]])), HybridSim(params, 1)
+    team, single = hang_level(params, np.array([[[0.0, 0.0, -1.0]]])), HybridSim(params, 1)
     single.place(team.get("pos_w"), vel_w=team.get("vel_w"))
     for command in commands(30, 1):
         for sim in (team, single):
@@ -76,7 +76,7 @@ def test_one_vehicle_is_the_fused_chain():
 def test_each_end_goes_after_its_lag_and_the_last_one_makes_the_landing():
     params = plant()
     late = replace(params.release, lag=params.release.lag + 0.03)
-    sim = hung(params, around(2), releases=[params.release, late])
+    sim = hang_level(params, around(2), releases=[params.release, late])
     gone = {}
     for k, command in enumerate(commands(12, 2)):
         sim.set_command(command, np.full(2, k == 2))

@@ -54,7 +54,7 @@ def plant() -> PlantParams:
     )
 
 
-def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
+def fly_hard_throw(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
     """A hard throw of a plant that is stated in these units; all that comes of it in SI units."""
     sim = HybridSim(p, 1, extensions=EVERYTHING)
     sim.place(np.array([[0.0, 0.0, 2.0]]) / units.length)
@@ -87,7 +87,10 @@ def test_a_plant_in_other_units_flies_the_same_flight(kind):
     if kind == "motor_mixing":  # on a kernel of the oracle's tests
         vehicle = plain_vehicle(p.vehicle, controller=kind)
         p = replace(p, vehicle=vehicle, rope=replace(p.rope, segments=1))
-    usual, other = flown(p, Units(1.0, 1.0)), flown(convert_units(p, UNITS), UNITS)
+    usual, other = (
+        fly_hard_throw(p, Units(1.0, 1.0)),
+        fly_hard_throw(convert_units(p, UNITS), UNITS),
+    )
     for name, value in usual.items():
         np.testing.assert_allclose(other[name], value, rtol=ROUNDING, atol=ROUNDING, err_msg=name)
 

@@ -19,7 +19,7 @@ import pytest
 from pytest import approx, fixture, mark
 
 from bench.sitl import override
-from bench.sitl.direct import opened, throw
+from bench.sitl.direct import open_runner, throw
 from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
@@ -316,7 +316,7 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     """The runner killed in hover and in a throw: the last sticks expire, or count until the pilot
     switches off, as the version's row of the table of facts says.
     """
-    report = override.killed(program(), tmp_path, state)
+    report = override.fly_until_killed(program(), tmp_path, state)
     sticks, expires = report["killed"], report["version"] >= EXPIRES - 1e-6
     print(f"\n{report['version']:g}, {state}: {sticks}")
     assert (sticks["expired"] is not None) == expires
@@ -348,7 +348,7 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
         "SIGINT twice": endings.REASONS["SIGINT"],
     } | endings.REASONS
     plant = make_motors("vision", 0)
-    with opened(
+    with open_runner(
         program(), tmp_path / way, params, endings.NEVER, plant, FakeMocapParams(), 0
     ) as parts:
         run = endings.Ending(way.split(" twice")[0], state, parts, monkeypatch)

@@ -49,7 +49,7 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
     assert "no checkpoint to resume from" in capsys.readouterr().err
 
 
-def hanging():
+def hang_in_view():
     """A vehicle whose payload and goal are in view, and the goal."""
     zero = np.zeros((1, 3))
     now = SimpleNamespace(
@@ -76,7 +76,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
         nuisances=Nuisances(*(0.0,) * 8),
         keep=True,
     )
-    now, goal = hanging()
+    now, goal = hang_in_view()
     points, valid = eyes.look(now, now, goal, np.array([True]))
     pilot = KeypointCamera(plain.camera, dtype=torch.float64)
     quat = torch.tensor(now.quat_wb / norm(now.quat_wb))
@@ -96,7 +96,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
 
 def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):
     loaded = load_policy("vision")
-    eyes, (now, goal) = _make_rendered_eyes(loaded, "contours", 3), hanging()
+    eyes, (now, goal) = _make_rendered_eyes(loaded, "contours", 3), hang_in_view()
     eyes.look(now, now, goal, np.array([True]))
     sheet = cv2.imread(str(eyes.sheet(tmp_path / "pixels.png")))
     lens = loaded.experiment.camera.fisheye

@@ -57,7 +57,7 @@ def whole(tmp_path_factory):
     return folder
 
 
-def trained(iterations, *extra):
+def train_briefly(iterations, *extra):
     """Trainer after so many iterations of a short schedule."""
     sets = (
         *SMALL[:2],
@@ -95,7 +95,7 @@ def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
 def test_the_teachers_action_is_learnt_where_it_has_a_weight():
     networks = []
     for weight in (0.0, 10.0):
-        trainer = trained(1, f"distillation.action_weight={weight}")
+        trainer = train_briefly(1, f"distillation.action_weight={weight}")
         networks.append(
             torch.cat([p.detach().flatten() for p in trainer.algorithm.network.parameters()])
         )
@@ -110,14 +110,14 @@ def test_the_targets_are_as_old_as_the_poses_that_the_teacher_learnt_from(monkey
         return exact(env, age)
 
     monkeypatch.setattr(ThrowEnv, "exact_frame", noted)
-    trainer = trained(1)
+    trainer = train_briefly(1)
     latency = trainer.algorithm.teacher.contract["observation"]["latency"]
     assert sorted(ages) == approx([np.mean(latency)])
     assert max(latency) > 0.0
 
 
 def test_a_throw_that_ended_teaches_no_more():
-    trainer = trained(0, "distillation.horizon=30", "task.bounds.time_limit=0.4")
+    trainer = train_briefly(0, "distillation.horizon=30", "task.bounds.time_limit=0.4")
     trainer.algorithm.collect(0.0)
     alive = trainer.algorithm._alive
     assert alive[0].all()

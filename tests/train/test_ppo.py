@@ -214,7 +214,7 @@ class Reach:
         return self.draw(), reward, torch.ones(self.num_envs), {}
 
 
-def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], list[float]]:
+def measure_distances(seed: int, iterations: int, *changes: str) -> tuple[list[float], list[float]]:
     """Mean distances of the trained actor's actions and of the exported ones from the observations,
     and each update's target of the divergence.
     """
@@ -235,7 +235,7 @@ def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], lis
 
 
 def test_steps_become_ever_smaller():
-    (distance, _), targets = reached(0, 24, "settled=0.5")
+    (distance, _), targets = measure_distances(0, 24, "settled=0.5")
     assert distance < 0.25
     assert targets[0] == approx(0.015)
     assert targets[:12] == sorted(set(targets[:12]), reverse=True)
@@ -246,7 +246,7 @@ def test_steps_become_ever_smaller():
 def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
     """At this rate the mean is 0.038 to 0.047 off, the last weights 0.074 to 0.137 (20 seeds)."""
     changes = ('schedule="fixed"', "learning_rate=0.01", "epochs=2")
-    (_, distance), _ = reached(seed, 60, *changes)
+    (_, distance), _ = measure_distances(seed, 60, *changes)
     assert distance < REACHED
 
 

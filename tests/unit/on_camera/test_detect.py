@@ -70,7 +70,7 @@ def known() -> Prior:
     return Prior((CAMERA.rot_cb @ ROT[0].T)[:, 2].numpy(), float(eye[2]), (0.25, 0.6))
 
 
-def off(detected: FrameDetections) -> np.ndarray:
+def measure_offsets(detected: FrameDetections) -> np.ndarray:
     """How far the keypoints are from the true ones [px], shape (8,)."""
     true, valid = keypoints(CAMERA, POS, ROT, GOAL, BALL)
     assert valid.all()
@@ -123,7 +123,7 @@ def test_ball_and_goal_are_found_under_each_nuisance(scene, nuisance, worst):
     detected = DETECTOR.detect(frame, known())
     assert detected.ball is not None
     assert detected.goal is not None
-    assert off(detected).max() < worst
+    assert measure_offsets(detected).max() < worst
     assert DETECTOR.detect(frame).ball is not None, "known things only narrow"
 
 

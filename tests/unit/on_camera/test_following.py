@@ -47,7 +47,7 @@ def throw(frames=40, pitch=0.8, thrust=16.0):
     return np.array(rots), np.array(rays)
 
 
-def followed(rots, rays, blind, seed=0):
+def follow(rots, rays, blind, seed=0):
     """By frame [rad]: errors of the detected ball (NaN: none) and of the prediction, and the search
     radius.
     """
@@ -77,7 +77,7 @@ def test_a_ball_that_is_lost_in_a_throw_reads_where_it_swings():
     for first in range(10, 34):
         blind = range(first, first + 5)
         held.append(math.acos(rays[first - 1] @ rays[first + 4]))
-        read.append(followed(rots, rays, blind, first)[0][first + 4])
+        read.append(follow(rots, rays, blind, first)[0][first + 4])
     assert np.median(held) > 0.2
     assert np.nanmedian(read) < 0.05
     assert np.nanmax(read) < 3.0 * LOST
@@ -86,7 +86,7 @@ def test_a_ball_that_is_lost_in_a_throw_reads_where_it_swings():
 def test_a_ball_is_where_it_is_looked_for():
     rots, rays = throw()
     for first in range(5, 30, 3):
-        _, off, within = followed(rots, rays, range(first, first + 8), first)
+        _, off, within = follow(rots, rays, range(first, first + 8), first)
         assert (off < within).all()
         assert (np.diff(within[first : first + 9]) > 0.0).all(), "ever wider while it is missed"
         assert within[first + 9] < within[first + 8], "and closer again"
@@ -94,7 +94,7 @@ def test_a_ball_is_where_it_is_looked_for():
 
 def test_what_is_lost_for_long_is_not_visible():
     rots, rays = throw()
-    read, _, within = followed(rots, rays, range(10, 40))
+    read, _, within = follow(rots, rays, range(10, 40))
     visible = ~np.isnan(read)
     assert visible[10:13].all()
     assert not visible[22:].any()

@@ -31,7 +31,7 @@ def renderer():
     return Renderer(LENS, samples=8)
 
 
-def hovering(ball=(0.05, 0.1, 1.0)):
+def make_hovering_scene(ball=(0.05, 0.1, 1.0)):
     """A plain scene, evenly lit, its ball without a seam."""
     scenes = make_plain_scenes(
         CAMERA,
@@ -46,7 +46,7 @@ def hovering(ball=(0.05, 0.1, 1.0)):
     return scenes
 
 
-def centroid(mask: np.ndarray) -> np.ndarray:
+def find_centroid(mask: np.ndarray) -> np.ndarray:
     v, u = np.nonzero(mask)
     return np.array([u.mean(), v.mean()])
 
@@ -56,13 +56,13 @@ def yellow(image) -> np.ndarray:
     return (np.minimum(r, g) - b > 40) & (np.abs(r - g) < 60)
 
 
-def green(image) -> np.ndarray:
+def find_green(image) -> np.ndarray:
     r, g, b = image.astype(int).transpose(2, 0, 1)
     return (g - np.maximum(r, b)) > 25
 
 
 def test_ball_and_square_are_where_the_lens_puts_them(renderer):
-    scenes = hovering()
+    scenes = make_hovering_scene()
     image = renderer.render(scenes)[0].numpy()
     truth, lens = truth_of(scenes, Fisheye(LENS)), Fisheye(LENS)
     ball, _ = lens.project(truth.ball_c)
@@ -70,9 +70,11 @@ def test_ball_and_square_are_where_the_lens_puts_them(renderer):
     area = cv2.moments(
         corners[0].float().numpy()
     )  # of the quadrangle: its nearer half is the larger one
-    assert_allclose(centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
+    assert_allclose(find_centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
     assert_allclose(
-        centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE
+        find_centroid(find_green(image)),
+        [area["m10"] / area["m00"], area["m01"] / area["m00"]],
+        atol=CENTRE,
     )
     assert truth.ball_visible.all()
     assert truth.goal_visible.all()
@@ -83,7 +85,7 @@ def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
     """A fast ball is smeared about where it is when its rows are exposed, off its place at the
     middle of the frame.
     """
-    scenes = hovering(ball=(-0.35, 0.1, 1.0))
+    scenes = make_hovering_scene(ball=(-0.35, 0.1, 1.0))
     scenes.ball[:, 4:7] = torch.tensor([[0.0, 4.0, 0.0]])
     scenes = replace(scenes, shutter=torch.tensor([[0.004, 0.04, 0.0]]))
     lens = Fisheye(LENS)
@@ -91,7 +93,9 @@ def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
     still, _ = lens.project(truth_of(replace(scenes, shutter=torch.zeros(1, 3)), lens).ball_c)
     assert (rolled - still).norm() > 3.0
     assert_allclose(
-        centroid(yellow(renderer.render(scenes)[0].numpy())), rolled[0].numpy(), atol=2 * CENTRE
+        find_centroid(yellow(renderer.render(scenes)[0].numpy())),
+        rolled[0].numpy(),
+        atol=2 * CENTRE,
     )
 
 

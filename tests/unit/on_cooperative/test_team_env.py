@@ -77,7 +77,7 @@ def test_rows_that_are_no_whole_worlds_are_refused():
         TeamEnv(experiment(), count=7)
 
 
-def least_gaps(env: TeamEnv) -> list[tuple[float, str]]:
+def find_least_gaps(env: TeamEnv) -> list[tuple[float, str]]:
     """Least gap of each world and what it is of, by loops over all pairs in float64."""
     state = {name: value.double() for name, value in env.views.state.items()}
     reach, rope = env.cfg.team.rotor_reach, env.cfg.rope
@@ -113,7 +113,7 @@ def test_the_gap_is_the_least_over_all_pairs(vehicles):
     state = env.views.state
     state["pos_w"] += 0.4 * torch.randn_like(state["pos_w"])
     state["attached"].copy_(torch.rand(env.rows) < 0.6)
-    expected = least_gaps(env)
+    expected = find_least_gaps(env)
     assert {kind for _, kind in expected} == {"load", "vehicle", "cable"}
     assert_close(env.gap().tolist(), [gap for gap, _ in expected], atol=1e-5, rtol=0)
 

@@ -13,7 +13,7 @@ from tests.synthetic_diagnosis import (
     SyntheticModel,
     catalogue,
     explain_without_laws,
-    linearised,
+    linearise_flights,
 )
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select import diagnose_flights, result
@@ -127,7 +127,7 @@ class Spoiled(SyntheticModel):
 
     shaken, rough, beyond = True, ROUGH, -1.0
 
-    def _spoilt(self, theta, residuals):
+    def _spoil(self, theta, residuals):
         if abs(theta.get("effect_00", 0.0)) / EFFECTS[0].floor <= self.beyond:
             return residuals
         noise = np.random.default_rng(1).standard_normal(len(residuals[BAD]))
@@ -139,7 +139,7 @@ class Spoiled(SyntheticModel):
         return [replace(w, shaken=self.shaken and i == BAD) for i, w in enumerate(inherited)]
 
     def residuals(self, theta, about=None):
-        return self._spoilt(theta, super().residuals(theta, about))
+        return self._spoil(theta, super().residuals(theta, about))
 
 
 @mark.parametrize(
@@ -149,7 +149,7 @@ class Spoiled(SyntheticModel):
 def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected):
     model = Spoiled(throws=8, seed=4)
     model.shaken, model.rough = shaken, rough
-    assert untracked_windows(linearised(model)) == expected
+    assert untracked_windows(linearise_flights(model)) == expected
 
 
 def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():

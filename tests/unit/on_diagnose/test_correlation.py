@@ -36,7 +36,7 @@ def noise(rng, count: int, colour: str) -> np.ndarray:
     return {"white": white, "first": first, "second": second}[colour][400:]
 
 
-def flown(seed: int, colour: str, **options) -> SyntheticModel:
+def fly_coloured(seed: int, colour: str, **options) -> SyntheticModel:
     """Flights whose sensors have noise of a colour."""
     model = SyntheticModel(
         effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=2, **options
@@ -50,14 +50,14 @@ def flown(seed: int, colour: str, **options) -> SyntheticModel:
     return model
 
 
-def estimated(model: SyntheticModel) -> dict[int, Correlation]:
+def estimate(model: SyntheticModel) -> dict[int, Correlation]:
     priors = Priors.of(model.effects, model.channels)
     return correlations(model.windows({}), priors.slab * priors.floor, 2)
 
 
 @mark.parametrize("order", [1, 2])
 def test_inner_products_are_those_of_the_dense_covariance(order):
-    window = flown(1, "white").windows({})[0]
+    window = fly_coloured(1, "white").windows({})[0]
     known = Correlation(0.02, 0.9, order, 1.7)
     (correlated,) = with_correlations([window], {1: known})
     dense = np.diag(window.sigma**2)
@@ -81,15 +81,15 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
 
 
 def test_white_noise_is_white():
-    assert not estimated(flown(2, "white"))
-    assert not estimated(flown(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), (
+    assert not estimate(fly_coloured(2, "white"))
+    assert not estimate(fly_coloured(2, "white", truth={"effect_02": 60.0, "effect_04": 40.0})), (
         "causes are not noise"
     )
 
 
 @mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
 def test_time_order_and_size_are_those_planted(colour, order):
-    fits = estimated(flown(3, colour))
+    fits = estimate(fly_coloured(3, colour))
     assert set(fits) == {0, 1}
     for fitted in fits.values():
         assert fitted.order == order
@@ -100,6 +100,6 @@ def test_time_order_and_size_are_those_planted(colour, order):
 
 def test_noise_that_is_correlated_is_no_cause(monkeypatch):
     """Taken for white, it yields false names or UNKNOWN."""
-    assert diagnose_flights.explain(flown(7, "first")).overall == result.NO_EFFECT
+    assert diagnose_flights.explain(fly_coloured(7, "first")).overall == result.NO_EFFECT
     monkeypatch.setattr(point, "correlations", lambda *_: {})
-    assert diagnose_flights.explain(flown(7, "first")).overall != result.NO_EFFECT
+    assert diagnose_flights.explain(fly_coloured(7, "first")).overall != result.NO_EFFECT

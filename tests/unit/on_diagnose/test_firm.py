@@ -54,7 +54,7 @@ def world(truth, **options) -> SyntheticModel:
 GAIN = result.ChannelGain("pos_w", "m", 0.02, 0.0101, 0.01, float("nan"), 0.5, 0.4, 0.6, ())
 
 
-def judged(monkeypatch, truth, same=(), **changes):
+def contradict(monkeypatch, truth, same=(), **changes):
     """A diagnosis that its held-out flights contradict."""
     plain = held_out.measure
 
@@ -75,7 +75,7 @@ def judged(monkeypatch, truth, same=(), **changes):
 def test_names_that_held_out_flights_do_not_confirm_are_none(
     monkeypatch, share, low, high, verdict, reason
 ):
-    diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=share, low=low, high=high)
+    diagnosis = contradict(monkeypatch, {"effect_05": 40.0}, share=share, low=low, high=high)
     assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
     assert diagnosis["effect_05"].verdict == verdict
     assert reason in diagnosis.reasons[0]
@@ -85,7 +85,7 @@ def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(m
     """Here the names bring the nats that they promise, and no channel's error falls for sure."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
     gain = replace(GAIN, after=0.019, gain=0.05, low=-0.1, high=0.2)
-    diagnosis = judged(monkeypatch, {"effect_05": 40.0}, channels=(gain,), folds=2)
+    diagnosis = contradict(monkeypatch, {"effect_05": 40.0}, channels=(gain,), folds=2)
     assert diagnosis["effect_05"].verdict == result.CANDIDATE
     assert "no channel's error falls for sure: pos_w 5 % [-10, 20]" in diagnosis.reasons[0]
     assert "fly once more, such as: swing" in diagnosis.reasons[0]
@@ -122,8 +122,8 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
     assert (once.interval, often.interval) == ("[no interval]", "[30, 60]")
     truth = {"effect_05": 40.0}
     with monkeypatch.context() as patch:
-        assert list(judged(patch, truth, channels=(once, often)).theta) == ["effect_05"]
-    assert not judged(monkeypatch, truth, channels=(once,)).theta
+        assert list(contradict(patch, truth, channels=(once, often)).theta) == ["effect_05"]
+    assert not contradict(monkeypatch, truth, channels=(once,)).theta
 
 
 def test_nothing_is_named_over_an_interval_that_holds_zero():
@@ -159,7 +159,7 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
         ),
     ):
         with monkeypatch.context() as patch:
-            diagnosis = judged(patch, truth, named_in=named_in, channels=channels)
+            diagnosis = contradict(patch, truth, named_in=named_in, channels=channels)
         assert diagnosis.reasons == (f"1 named, 1 candidate besides{error}",)
     assert diagnosis["effect_02"].verdict == result.CANDIDATE
     assert "repeated without some flights, does not always" in diagnosis["effect_02"].sentence
@@ -177,7 +177,7 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
 def test_held_out_figures_are_those_of_the_names_that_stay(monkeypatch):
     plain = held_out.measure
     truth, named_in = {"effect_05": 40.0, "effect_02": 40.0}, {"effect_05": 1.0}
-    diagnosis = judged(monkeypatch, truth, named_in=named_in)
+    diagnosis = contradict(monkeypatch, truth, named_in=named_in)
     assert list(diagnosis.theta) == ["effect_05"]
     again = plain(replace(diagnosis, work=replace(diagnosis.work, crossed=None)))
     assert diagnosis.held_out.share == again.share
@@ -188,7 +188,7 @@ def test_held_out_figures_are_those_of_the_names_that_stay(monkeypatch):
 def test_a_withdrawn_class_is_one_candidate(monkeypatch):
     truth = {"effect_05": 40.0, "effect_03": 12.0}
     same = {"effect_07": ("effect_03", 0.5)}
-    diagnosis = judged(monkeypatch, truth, same, named_in={"effect_05": 1.0})
+    diagnosis = contradict(monkeypatch, truth, same, named_in={"effect_05": 1.0})
     assert diagnosis["effect_03"].partners == ("effect_07",)
     assert diagnosis["effect_03"].verdict == diagnosis["effect_07"].verdict == result.CANDIDATE
     assert diagnosis.reasons[0].startswith("1 named, 1 candidate besides")

@@ -24,7 +24,7 @@ PLANT = paper_plant()
 WEIGHT = GRAVITY * PLANT.total_mass
 
 
-def flown(seed: int, lag: float = 0.05) -> FlightLog:
+def lag_rates(seed: int, lag: float = 0.05) -> FlightLog:
     """Attitudes of a vehicle whose rates follow its commands ``lag`` seconds later, and the
     commands.
     """
@@ -59,17 +59,17 @@ WRONG = {
 
 @fixture(scope="module")
 def logs():
-    return [flown(seed) for seed in range(3)]
+    return [lag_rates(seed) for seed in range(3)]
 
 
-def changed(log, change):
+def change_command(log, change):
     c = log["command"]
     return with_channels(log, command=Channel(c.time, change(c.values), c.unit, c.frame))
 
 
 @mark.parametrize("name", WRONG)
 def test_each_mistake_is_suspected_and_put_right(logs, name):
-    wrong = [changed(log, WRONG[name]) for log in logs]
+    wrong = [change_command(log, WRONG[name]) for log in logs]
     mistakes = suspected(wrong, PLANT)
     assert [m.name for m in mistakes] == [name.split(" ")[0]]
     assert mistakes[0].logs == 3
@@ -82,7 +82,9 @@ def test_each_mistake_is_suspected_and_put_right(logs, name):
 def test_mistakes_that_come_together_are_all_suspected(logs):
     degrees = 180.0 / np.pi
     turned = [
-        changed(log, lambda u: u[:, [0, 1, 3, 2]] * [1000.0 / GRAVITY, -degrees, degrees, degrees])
+        change_command(
+            log, lambda u: u[:, [0, 1, 3, 2]] * [1000.0 / GRAVITY, -degrees, degrees, degrees]
+        )
         for log in logs
     ]
     assert [m.name for m in suspected(turned, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
@@ -90,18 +92,18 @@ def test_mistakes_that_come_together_are_all_suspected(logs):
 
 def test_good_logs_and_logs_that_disagree_are_not_suspected(logs):
     assert suspected(logs, PLANT) == []
-    mixed = [changed(logs[0], WRONG["rate_axes"]), *logs[1:]]
+    mixed = [change_command(logs[0], WRONG["rate_axes"]), *logs[1:]]
     assert suspected(mixed, PLANT) == []
     strangers = [
-        changed(log, lambda u, other=other: other["command"].values)
+        change_command(log, lambda u, other=other: other["command"].values)
         for log, other in zip(logs, [*logs[1:], logs[0]])
     ]
     assert suspected(strangers, PLANT) == []
-    heavier = [changed(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in logs]
+    heavier = [change_command(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in logs]
     assert suspected(heavier, PLANT) == []
 
 
-def simulated(logs):
+def simulate(logs):
     return ThrowModel(logs, PLANT, only=["com_x"])
 
 
@@ -110,7 +112,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     """A real mistake stays corrected; one suspected without reason is dropped again."""
     flights = fly(setting_with({}), free=1, throws=0, seconds=1.0, seed=3)
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
-    wrong = [changed(log, both) for log in flights]
+    wrong = [change_command(log, both) for log in flights]
     if not change:  # as a relation by chance would have it
         turned = np.diag([1.0, 1.0, 1.0, -1.0]).tolist()
         monkeypatch.setattr(
@@ -118,7 +120,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
             "suspected",
             lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)],
         )
-    model, logs = correct_interface_mistakes(wrong, PLANT, simulated)
+    model, logs = correct_interface_mistakes(wrong, PLANT, simulate)
     assert [m.name for m in model.mistakes] == names
     assert all(m.nats > 100.0 for m in model.mistakes)
     assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2

@@ -37,7 +37,7 @@ FREE = {"est_vel_w", "motor_command", "current", "angle_rate", "torque_command_b
 """Channels whose order or kind the proposal asks about, or that it leaves out."""
 
 
-def hanging(time: np.ndarray) -> np.ndarray:
+def hang(time: np.ndarray) -> np.ndarray:
     """Where a payload swings below its vehicle [m]."""
     swing = 0.2 * np.sin(3.0 * time)
     return 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
@@ -96,7 +96,7 @@ def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
 def test_the_input_that_the_force_follows_drives_the_vehicle():
     columns = flight(20.0)
     thrust = columns["command"][:, 0]
-    table = flown_by_motors(columns, thrust, "motor") | named("acc", columns["acc_b"])
+    table = fly_by_motors(columns, thrust, "motor") | named("acc", columns["acc_b"])
     other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
     proposal = propose(table | {"thrust": other}, "a.csv")
     assert proposal.flyer["input"] == "motor_command"
@@ -124,7 +124,7 @@ def test_a_payload_belongs_to_the_path_that_it_hangs_below():
     """The first of three paths is another vehicle's."""
     time = np.arange(0.0, 20.0, 0.01)
     path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 2.0 + 0.2 * np.sin(time)])
-    below = hanging(time)
+    below = hang(time)
     columns = {"time": time} | named("pos_a", 0.7 * path[::-1] + 1.0)
     columns |= named("pos_b", path) | named("pos_c", path + below)
     made = {entry.name: entry.columns[0] for entry in propose(columns, "a").mapping.channels}
@@ -161,7 +161,7 @@ def test_a_payload_belongs_to_the_path_that_it_hangs_below():
 def test_a_column_is_found_under_another_laboratorys_name(thrust, load, names):
     columns = flight(20.0)
     lean = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX", degrees=True)[:, ::-1]
-    below = hanging(columns["time"])
+    below = hang(columns["time"])
     table = {"utc_ms": 1.7e12 + 1e3 * columns["time"], thrust: columns["command"][:, 0]}
     path, speed = 1e3 * columns["pos_w"], 1e3 * columns["vel_w"]
     flown = np.hstack([path, lean, np.degrees(columns["rate_b"]), columns["acc_b"], speed])
@@ -241,7 +241,7 @@ def test_an_unknown_number_becomes_a_question(tmp_path):
         table_of(f"{tmp_path}/a.csv+{tmp_path}/b.csv")
 
 
-def unnamed(
+def make_unnamed(
     columns: dict[str, np.ndarray], length: str, angle: str, above: float = 0.0
 ) -> dict[str, np.ndarray]:
     """Position, over a point so far above the floor, and angles, in units that no name says."""
@@ -262,14 +262,16 @@ def test_metres_with_radians_differ_from_centimetres_with_degrees_or_become_a_qu
     of the lean.
     """
     for units in (("cm", "deg"), ("m", "rad")):
-        proposal = propose(unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv")
+        proposal = propose(
+            make_unnamed(flight(20.0, seed=seed, scale=0.05), *units, above=2.9), "a.csv"
+        )
         made = units_of(proposal)
         questions = "".join(proposal.questions)
         assert made == {"pos_w": units[0], "quat_wb": units[1]} or "with deg would do" in questions
 
 
 def test_angles_that_would_turn_a_flight_over_are_in_degrees():
-    proposal = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
+    proposal = propose(make_unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
     assert units_of(proposal) == {"pos_w": "mm", "quat_wb": "deg"}
     assert "deg, axes x,y,z by gravity" in proposal.why["quat_wb"]
     assert not proposal.questions
@@ -479,7 +481,7 @@ def test_an_attitude_that_comes_too_seldom_is_refused_by_its_period():
         record_of(log)
 
 
-def flown_by_motors(columns: dict[str, np.ndarray], motors: np.ndarray, name: str) -> dict:
+def fly_by_motors(columns: dict[str, np.ndarray], motors: np.ndarray, name: str) -> dict:
     """Table of a flight whose four motors have the same numbers."""
     table = {"time": columns["time"]} | named("pos", columns["pos_w"])
     table |= {f"q{a}": c for a, c in zip("xyzw", columns["quat_wb"].T)}
@@ -495,7 +497,7 @@ def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     columns = flight(20.0)
     share = columns["command"][:, 0] / np.max(columns["command"][:, 0])
     motors = counts(share) if counts is not None else 1000.0 + 900.0 * share
-    table = flown_by_motors(columns, motors, name)
+    table = fly_by_motors(columns, motors, name)
     proposal = propose(table, "a.csv", mass=0.2)
     (log,) = logs_of(table, proposal.mapping, "a.csv")
     thrust = model_thrust(log, proposal)
@@ -544,7 +546,7 @@ def test_a_flag_is_no_number_of_a_flight():
 def test_a_thrust_in_shares_of_the_full_one_is_doubted():
     """Kilograms of thrust fit it to 20 %."""
     columns = flight(20.0)
-    table = flown_by_motors(columns, 0.7 + 0.0 * columns["time"], "motor")
+    table = fly_by_motors(columns, 0.7 + 0.0 * columns["time"], "motor")
     table["hover_thrust"] = 0.32 * columns["command"][:, 0]
     proposal = propose(table, "a.csv", mass=0.9)
     assert asks(proposal, "or a share of the full thrust?")

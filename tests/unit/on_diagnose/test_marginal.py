@@ -23,10 +23,10 @@ EFFECTS = catalogue(6)
 
 def likelihood(gram, levels, window):
     """Logarithm of it, of one window by itself, but for the powers of 2 pi."""
-    return -0.5 * alone(gram, levels, window).square[0]
+    return -0.5 * single_window(gram, levels, window).square[0]
 
 
-def alone(gram, levels, window):
+def single_window(gram, levels, window):
     """Statistics of a single window."""
     levels = replace(levels, share=levels.share[[window]])
     return Integrals([gram], levels).statistics([gram], np.zeros(0))

@@ -78,7 +78,7 @@ def estimate(model, names) -> dict[str, tuple[float, float]]:
     }
 
 
-def near(estimates, name, truth) -> bool:
+def assert_near(estimates, name, truth) -> bool:
     value, sd = estimates[name]
     return abs(value - truth) < 3.0 * sd
 
@@ -91,8 +91,8 @@ class TestBall:
             BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"]
         )
         assert estimates["ball_drag"][0] == approx(0.04, rel=0.03)
-        assert near(estimates, "ball_drag", 0.04)
-        assert near(estimates, "top_spin", 0.0)
+        assert assert_near(estimates, "ball_drag", 0.04)
+        assert assert_near(estimates, "top_spin", 0.0)
 
     def test_spin_is_found(self):
         logs = [ball_log(spin=(0.0, 0.0, 0.3), seed=i, heading=2.1 * i) for i in range(3)]
@@ -334,7 +334,7 @@ class TestFlyer:
         assert good < 0.1 * bad
 
     @staticmethod
-    def carried(place: list[float], rise=0.0) -> FlightLog:
+    def carry_weight(place: list[float], rise=0.0) -> FlightLog:
         """Four seconds at a place, under the vehicle's weight and a share more each second."""
         time = np.arange(0.0, 4.0, 0.01)
         thrust = FLYER.mass * G * (1.0 + rise * time[:, None])
@@ -354,7 +354,7 @@ class TestFlyer:
     )
     def test_effects_push_a_hovering_vehicle_as_their_equations_say(self, name, size, expected):
         """Closed form: half the acceleration that an effect makes times the time squared."""
-        model = FlyerModel([self.carried([0.0, 0.0, 2.0])], DRIVEN_BY_THRUST)
+        model = FlyerModel([self.carry_weight([0.0, 0.0, 2.0])], DRIVEN_BY_THRUST)
         measured = []
         for theta in ({}, {name: size}):
             lanes = model._lanes(model.size(theta))
@@ -366,7 +366,7 @@ class TestFlyer:
         )  # the angle squared
 
     def test_a_neighbour_is_measured_in_the_tilted_frame_too(self):
-        log = self.carried([3.0, 0.0, 2.0])
+        log = self.carry_weight([3.0, 0.0, 2.0])
         place = log["pos_w"]
         above = replace(place, values=place.values + [0.0, 0.0, 1.0])
         model = FlyerModel([with_channels(log, neighbour_pos_w=above)], DRIVEN_BY_THRUST)
@@ -378,7 +378,7 @@ class TestFlyer:
     @mark.parametrize("step", [0.02, 0.03, 0.06])
     def test_thrusts_keep_their_time_where_no_number_of_steps_fills_the_window(self, step):
         params = replace(DRIVEN_BY_THRUST, motor_time_constant=0.001, step=step)
-        model = FlyerModel([self.carried([0.0, 0.0, 2.0], rise=0.1)], params)
+        model = FlyerModel([self.carry_weight([0.0, 0.0, 2.0], rise=0.1)], params)
         driven = model._commands(model._lanes(model.size({})))
         since = driven["command_time"][0] + 0.5 * model.row
         held = (driven["command"][0].sum(1) / (FLYER.mass * G) - 1.0) / 0.1

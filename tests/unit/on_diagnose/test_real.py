@@ -37,7 +37,7 @@ SETUPS = {
 }
 
 
-def explained(setup: str, *paths: str | Path):
+def explain_logs(setup: str, *paths: str | Path):
     logs = setups.read_logs(paths, setup)
     model = setups.model_of(setups.load(setup), logs)
     diagnosis = explain(model, seed=0)
@@ -88,7 +88,7 @@ def test_two_drones_run_on_two_clocks():
 @mark.slow
 def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
     flights = [REAL / "payload_cf_single" / f"log{number}.csv.gz" for number in (204, 205, 206)]
-    diagnosis, named, rms = explained("cf_payload", *flights)
+    diagnosis, named, rms = explain_logs("cf_payload", *flights)
     assert named & {"rope_length", "marker_z"}
     assert named & {"thrust_gain", "mass_quad"}
     length = next(
@@ -102,7 +102,7 @@ def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
 
 @mark.slow
 def test_thrust_map_drag_and_battery_of_nanobench():
-    diagnosis, named, rms = explained(
+    diagnosis, named, rms = explain_logs(
         "nanobench_cf21", REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
     )
     assert named & {"thrust_gain", "mass_quad"}
@@ -114,10 +114,10 @@ def test_thrust_map_drag_and_battery_of_nanobench():
 def test_a_motor_idles_and_a_hundred_motors_are_not_one():
     table = REAL / "motor_prop_stand" / "all_tests.csv.gz"
     for pair in ("a1", "c1", "g1"):  # one motor, one propeller, two supplies
-        diagnosis, named, _ = explained("motor_stand", f"{table}:{pair}_*")
+        diagnosis, named, _ = explain_logs("motor_stand", f"{table}:{pair}_*")
         assert diagnosis.overall == UNKNOWN  # two tests, one left out in turn, confirm nothing
         assert diagnosis["idle_power"].verdict == CANDIDATE
         assert 1.0 < diagnosis["idle_power"].estimate < 5.0
-    diagnosis, named, _ = explained("motor_stand", table)
+    diagnosis, named, _ = explain_logs("motor_stand", table)
     assert diagnosis.overall != NO_EFFECT
     assert "thrust_voltage" not in named

@@ -11,7 +11,12 @@ from pytest import approx, mark
 from scipy.special import logsumexp
 
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
-from tests.synthetic_diagnosis import SyntheticModel, altered, explain_without_laws, pushed
+from tests.synthetic_diagnosis import (
+    SyntheticModel,
+    alter_windows,
+    explain_without_laws,
+    push_window,
+)
 from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -37,7 +42,7 @@ PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
 LEAST = 4.0
 
 
-def chosen_of(statistics, effects=EFFECTS, priors=PRIORS, least=LEAST):
+def choose(statistics, effects=EFFECTS, priors=PRIORS, least=LEAST):
     """Return the best set of candidates, and the deviations of its random shares in their unit."""
     offered = shared(effects) + random_shares(effects, priors, statistics)
     linear = Linear(statistics, priors, offered, lambda s: sum(least + c.penalty for c in s))
@@ -89,17 +94,17 @@ def campaign(rng, days, by_day, by_flight):
     return replace(statistics, score=score, days=np.repeat(np.arange(days), 3))
 
 
-def on_days(rng, *deviations) -> set[str]:
+def find_day_groups(rng, *deviations) -> set[str]:
     """Return the groups with a random share of the release's lag."""
     statistics = campaign(rng, 5, *deviations)
-    return {c.group for c in chosen_of(statistics)[0] if c.name == "lag_jitter"}
+    return {c.group for c in choose(statistics)[0] if c.name == "lag_jitter"}
 
 
 def test_what_is_drawn_anew_each_day_drifts():
     rng = default_rng(8)
-    worlds = [on_days(rng, 0.012, 0.0) for _ in range(12)]
+    worlds = [find_day_groups(rng, 0.012, 0.0) for _ in range(12)]
     assert np.mean([w == {DAY} for w in worlds]) > 0.7
-    assert not any(on_days(rng, 0.0, 0.0) for _ in range(20))
+    assert not any(find_day_groups(rng, 0.0, 0.0) for _ in range(20))
 
 
 def test_a_drift_is_reported_with_its_size_and_its_days():
@@ -149,11 +154,11 @@ def test_shares_of_days_come_before_those_of_flights():
 
 def test_deviations_are_found_with_their_size():
     rng = default_rng(5)
-    worlds = [chosen_of(flights(rng, release_lag=0.012))[1] for _ in range(15)]
+    worlds = [choose(flights(rng, release_lag=0.012))[1] for _ in range(15)]
     assert np.mean(["lag_jitter" in w for w in worlds]) > 0.9
     assert not any("gust" in w for w in worlds)
     assert abs(np.median([w.get("lag_jitter", 0.0) for w in worlds]) - 0.012) < 0.003
-    gusts = [chosen_of(flights(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25))[1] for _ in range(25)]
+    gusts = [choose(flights(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25))[1] for _ in range(25)]
     assert np.mean(["gust" in w for w in gusts]) > 0.9
     assert abs(np.median([w.get("gust", 0.0) for w in gusts]) - 0.25) < 0.08
 
@@ -190,10 +195,10 @@ DELAYED = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumer
 FLOOR = DELAYED[4].floor
 
 
-def drawn(sizes, **options) -> SyntheticModel:
+def draw_flights(sizes, **options) -> SyntheticModel:
     """Return flights each of which has its own size of one effect, in floors."""
-    return altered(
-        lambda m, w: pushed(m, w, cmd_delay=sizes[w.flight]),
+    return alter_windows(
+        lambda m, w: push_window(m, w, cmd_delay=sizes[w.flight]),
         effects=DELAYED,
         throws=len(sizes) - 1,
         **options,
@@ -227,7 +232,7 @@ def test_what_single_flights_differ_by_is_integrated_out():
 @mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
     sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
-    diagnosis = explain_without_laws(drawn(sizes, seed=seed))
+    diagnosis = explain_without_laws(draw_flights(sizes, seed=seed))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("cmd_delay",)
     finding, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
@@ -241,7 +246,7 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
 
 def test_an_effect_that_varies_about_nothing_is_not_named():
     sizes = 6.0 * default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
-    diagnosis = explain_without_laws(drawn(sizes, seed=5))
+    diagnosis = explain_without_laws(draw_flights(sizes, seed=5))
     assert not diagnosis.theta
     assert delay_jitter(diagnosis).found
     mean = delay_jitter(diagnosis).mean["cmd_delay"]

@@ -11,12 +11,12 @@ from pytest import approx, mark, raises
 from tests.synthetic_diagnosis import (
     EFFECTS,
     SyntheticModel,
-    altered,
+    alter_windows,
     explain_without_laws,
-    pushed,
+    push_window,
     selector_of,
 )
-from tests.unit.on_diagnose.test_scatter import chosen_of
+from tests.unit.on_diagnose.test_scatter import choose
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -73,9 +73,9 @@ def hiding(share: float, **options) -> SyntheticModel:
     def change(model, window):
         columns = window.effects.copy()
         columns[:, 7] = share * columns[:, 7] - columns[:, 3]
-        return pushed(model, replace(window, effects=columns), effect_03=14.0, effect_07=14.0)
+        return push_window(model, replace(window, effects=columns), effect_03=14.0, effect_07=14.0)
 
-    return altered(change, seed=3, **options)
+    return alter_windows(change, seed=3, **options)
 
 
 @mark.parametrize("beside", [{}, {"effect_04": 10.0}])
@@ -126,9 +126,9 @@ def test_two_causes_are_classes_with_one_that_stands_in_for_both():
         columns = window.effects.copy()
         both = floor[3] * columns[:, 3] + floor[4] * columns[:, 4]
         columns[:, 8] = both / floor[8] + 0.132 * columns[:, 8]
-        return pushed(model, replace(window, effects=columns), effect_03=20.0, effect_04=20.0)
+        return push_window(model, replace(window, effects=columns), effect_03=20.0, effect_04=20.0)
 
-    diagnosis = explain_without_laws(altered(change, seed=3))
+    diagnosis = explain_without_laws(alter_windows(change, seed=3))
     assert [set(names) for names, _ in diagnosis.sets] == [
         {"effect_03", "effect_04"},
         {"effect_08"},
@@ -150,7 +150,9 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
 
 
 def test_what_happened_in_one_flight_is_an_event_and_no_cause():
-    model = altered(lambda m, w: pushed(m, w, effect_03=40.0) if w.flight == 4 else w, throws=9)
+    model = alter_windows(
+        lambda m, w: push_window(m, w, effect_03=40.0) if w.flight == 4 else w, throws=9
+    )
     diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert diagnosis.events == (4,)
@@ -168,12 +170,14 @@ def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, ev
         push = force * np.sin(2.0 * np.pi * np.linspace(0.0, 1.0, np.count_nonzero(along)))
         return replace(window, residual=window.residual + window.latent[:, along] @ push)
 
-    model = altered(stirred, seed=3, throws=9, gust=0.0, rate=200)
+    model = alter_windows(stirred, seed=3, throws=9, gust=0.0, rate=200)
     assert explain_without_laws(model).events == events
 
 
 def test_signs_that_change_from_flight_to_flight_are_reported_as_what_varies():
-    model = altered(lambda m, w: pushed(m, w, effect_03=15.0 * (-1) ** w.flight), throws=9)
+    model = alter_windows(
+        lambda m, w: push_window(m, w, effect_03=15.0 * (-1) ** w.flight), throws=9
+    )
     diagnosis = explain_without_laws(model)
     assert not diagnosis.theta
     assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [
@@ -184,7 +188,7 @@ def test_signs_that_change_from_flight_to_flight_are_reported_as_what_varies():
 
 def test_flights_that_differ_each_for_itself_leave_nothing_to_vary():
     sizes = (20.0, 0.0, 26.0, 0.0, 0.0, 20.0)
-    model = altered(lambda m, w: pushed(m, w, effect_03=sizes[w.flight]), throws=5)
+    model = alter_windows(lambda m, w: push_window(m, w, effect_03=sizes[w.flight]), throws=5)
     diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis.events == (0, 2, 5)
     assert diagnosis.overall == result.KNOWN
@@ -201,7 +205,7 @@ def best_set(sizes) -> set[str]:
         np.arange(len(sizes)), information, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
     )
     effects = [replace(EFFECTS[3], prior_sd=20.0, floor=1.0)]
-    best, _ = chosen_of(statistics, effects=effects, priors=priors, least=5.0)
+    best, _ = choose(statistics, effects=effects, priors=priors, least=5.0)
     return {c.name for c in best}
 
 
@@ -240,7 +244,7 @@ def test_commands_of_other_flights_are_inconsistent_data():
 
 
 def test_a_simulation_that_fails_is_out_of_domain():
-    failing = altered(lambda m, w: replace(w, residual=np.full_like(w.residual, np.nan)))
+    failing = alter_windows(lambda m, w: replace(w, residual=np.full_like(w.residual, np.nan)))
     diagnosis = diagnose_flights.explain(failing)
     assert diagnosis.overall == result.OUT_OF_DOMAIN
     assert not diagnosis.theta
@@ -248,7 +252,7 @@ def test_a_simulation_that_fails_is_out_of_domain():
 
 
 def test_a_few_windows_that_fail_are_left_out_and_counted():
-    some = altered(
+    some = alter_windows(
         lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
         truth={"effect_03": 10.0},
     )
@@ -397,7 +401,7 @@ def test_a_window_that_no_force_explains_is_left_out():
             residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)),
         )
 
-    model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
+    model = alter_windows(spoil, truth={"effect_03": 10.0}, seed=4)
     diagnosis = explain_without_laws(model)
     assert diagnosis.windows == len(model.windows({})) - 1
     assert tuple(diagnosis.theta) == ("effect_03",)

@@ -48,7 +48,7 @@ BESIDE_THE_PLAN = {
 """What separates effects and is no manoeuvre of a plan: work on the ground, or other equipment."""
 
 
-def hovered(folder, hidden: str) -> tuple[np.ndarray, np.ndarray]:
+def hover(folder, hidden: str) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the vehicle's and the payload's measured places [m] in a hover of a world."""
     world = f"--set {hidden} --device cpu"
     assert run_command(f"diagnose simulate hover {world} --seed 3 --out {folder}") == 0
@@ -61,11 +61,11 @@ def test_flights_hold_what_the_world_hides(tmp_path):
     """A payload hangs as far below as the rope is longer, and below the frame's origin, which
     motion capture sees, wherever the centre of mass lies.
     """
-    vehicle, payload = hovered(tmp_path, "rope.length=0.33")
+    vehicle, payload = hover(tmp_path, "rope.length=0.33")
     plain = payload - vehicle
-    vehicle, payload = hovered(tmp_path, "rope.length=0.43")
+    vehicle, payload = hover(tmp_path, "rope.length=0.43")
     assert payload - vehicle - plain == approx([0.0, 0.0, -0.1], abs=2e-3)
-    vehicle, payload = hovered(tmp_path, "vehicle.body.com=[0.02,0.0,0.0]")
+    vehicle, payload = hover(tmp_path, "vehicle.body.com=[0.02,0.0,0.0]")
     assert payload - vehicle - plain == approx([0.0, 0.0, 0.0], abs=5e-3)
 
 

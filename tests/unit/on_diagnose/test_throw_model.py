@@ -17,7 +17,7 @@ from sim.effects.setting import AERODYNAMICS, generalise
 from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from tests.synthetic_diagnosis import explain_without_laws, linearised, selector_of
+from tests.synthetic_diagnosis import explain_without_laws, linearise_flights, selector_of
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors
@@ -165,7 +165,7 @@ def test_initial_states_follow_the_effects(planted):
     transient hides its effect.
     """
     model = model_of(planted[0], "com_y")
-    nominal, size = linearised(model), np.array([15.0])
+    nominal, size = linearise_flights(model), np.array([15.0])
     blind = {i: replace(w, effects=0.0 * w.effects) for i, w in nominal.about.windows.items()}
     fixed = replace(nominal, about=replace(nominal.about, windows=blind))  # its states stay behind
     follow, behind = (moved(point, size) for point in (nominal, fixed))
@@ -211,7 +211,7 @@ HIDDEN = {
 }
 
 
-def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
+def film(log: FlightLog, camera: CameraParams) -> FlightLog:
     """A log with what a camera with :data:`HIDDEN` saw of its poses, row by row, and where the
     payload landed.
     """
@@ -267,7 +267,7 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
 
 def test_camera_and_landing_plane_are_given_beside_the_poses(planted):
     camera = load_experiment("state").camera
-    logs = [looked_at(log, camera) for log in planted[0]]
+    logs = [film(log, camera) for log in planted[0]]
     names = [*HIDDEN, "marker_rot_x"]
     model = ThrowModel(logs, setting_with(PLANTED).plant, camera=camera, only=names)
     assert {"keypoints", "landing"} <= set(model.channels)
@@ -384,7 +384,7 @@ no gust is thought possible.
 """
 
 
-def swayed(log: FlightLog) -> FlightLog:
+def sway(log: FlightLog) -> FlightLog:
     """The log with :data:`SWAY` added to its positions."""
     size, rate, phase = SWAY
     moved = {
@@ -415,7 +415,7 @@ def throw_logs():
 
 def test_gusts_do_not_take_the_place_of_states(throw_logs):
     calm, shaken = (
-        begun(model_of(logs, "rope_length")) for logs in (throw_logs, map(swayed, throw_logs))
+        begun(model_of(logs, "rope_length")) for logs in (throw_logs, map(sway, throw_logs))
     )
     away = shaken["rate_b"] - calm["rate_b"]
     assert np.sqrt(np.mean(away**2)) < RATE_KEPT
@@ -468,7 +468,7 @@ def test_lost_commands_are_found_beside_a_cause():
 def test_few_lost_commands_are_found():
     """Those that clearly came say little against them."""
     logs = fly(setting_with({}), seed=10, free=1, throws=2, seconds=3.0, lost=0.03)
-    share, _ = dropped.verdict(linearised(model_of(logs, *ONLY)), (), 5.0)
+    share, _ = dropped.verdict(linearise_flights(model_of(logs, *ONLY)), (), 5.0)
     assert share.found
     assert share.low < 0.03 < share.high
 

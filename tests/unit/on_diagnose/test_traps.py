@@ -25,7 +25,7 @@ FLIGHTS = (204, 205, 206)
 
 
 @cache
-def recorded(number: int) -> FlightLog:
+def record(number: int) -> FlightLog:
     return setups.read_logs([REAL / "payload_cf_single" / f"log{number}.csv.gz"], "cf_payload")[0]
 
 
@@ -34,11 +34,11 @@ PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 LATE = 0.1
 
 
-def changed(log: FlightLog, names, change) -> FlightLog:
+def change_values(log: FlightLog, names, change) -> FlightLog:
     return with_values(log, dict.fromkeys(names, change))
 
 
-def shifted(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
+def shift(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:
     return with_channels(log, **{n: replace(log[n], time=log[n].time + by) for n in names})
 
 
@@ -48,12 +48,12 @@ def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
 
 @mark.parametrize("number", FLIGHTS)
 def test_flights_as_they_are(number):
-    assert bad(recorded(number)) == ""
+    assert bad(record(number)) == ""
 
 
 @mark.parametrize("number", [204, 205])
 def test_exchanged_axes_are_named_with_their_evidence(number):
-    text = bad(changed(recorded(number), PATHS, lambda v: v[:, [1, 0, 2]]))
+    text = bad(change_values(record(number), PATHS, lambda v: v[:, [1, 0, 2]]))
     assert "fit with (y,x,z) of positions and velocities" in text
     assert float(text.split(" nats better")[0].split()[-1]) > 15.0
     assert "a mirror image" in text
@@ -61,7 +61,7 @@ def test_exchanged_axes_are_named_with_their_evidence(number):
 
 def test_an_exchanged_accelerometer_is_named():
     assert "acc_b fits as (y,x,z)" in bad(
-        changed(recorded(204), ["acc_b"], lambda v: v[:, [1, 0, 2]])
+        change_values(record(204), ["acc_b"], lambda v: v[:, [1, 0, 2]])
     )
 
 
@@ -74,21 +74,21 @@ def test_an_exchanged_accelerometer_is_named():
     ],
 )
 def test_late_streams_are_named_with_their_offset(streams, row):
-    (checked,) = check([shifted(recorded(204), *streams)], CRAZYFLIE)
+    (checked,) = check([shift(record(204), *streams)], CRAZYFLIE)
     (delay,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
     assert delay.figures["delay_s"] == approx(LATE, abs=0.02)
     assert contradictions([checked])
 
 
 def test_thrust_of_another_flight_is_refused():
-    text = bad(with_channels(recorded(205), thrust_command=recorded(204)["thrust_command"]))
+    text = bad(with_channels(record(205), thrust_command=record(204)["thrust_command"]))
     assert "the force does not follow the thrust" in text
     assert "thrust of another flight" in text
 
 
 def test_early_thrust_is_named():
     assert "the stream of the thrust is about" in bad(
-        shifted(recorded(206), "thrust_command", by=-LATE)
+        shift(record(206), "thrust_command", by=-LATE)
     )
 
 
@@ -106,7 +106,7 @@ def test_early_thrust_is_named():
     ],
 )
 def test_units_are_named_by_their_ratio(names, factor, words):
-    text = bad(changed(recorded(204), names, lambda v: v * factor))
+    text = bad(change_values(record(204), names, lambda v: v * factor))
     assert all(part in text for part in words.split(".*")), text
 
 
@@ -115,19 +115,22 @@ def test_units_are_named_by_their_ratio(names, factor, words):
     [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")],
 )
 def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
-    text = bad(recorded(204), replace(CRAZYFLIE, mass=mass))
+    text = bad(record(204), replace(CRAZYFLIE, mass=mass))
     assert words in text
     assert bool(text) == bool(words)
 
 
 def test_the_cable_is_held_against_the_models():
     assert "apart by +70.8 % of the model's cable of 0.3 m: another cable" in bad(
-        recorded(204), KnownVehicle(cable_length=0.3)
+        record(204), KnownVehicle(cable_length=0.3)
     )
 
 
 def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
-    logs = [*map(recorded, FLIGHTS), changed(recorded(205), ["thrust_command"], lambda v: 1.3 * v)]
+    logs = [
+        *map(record, FLIGHTS),
+        change_values(record(205), ["thrust_command"], lambda v: 1.3 * v),
+    ]
     texts = [row.text for row in check(logs, CRAZYFLIE)[3].rows if row.verdict == "warn"]
     assert any("the thrust's scale differs from flight to flight" in text for text in texts)
 

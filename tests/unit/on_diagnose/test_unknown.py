@@ -18,7 +18,7 @@ from tests.synthetic_diagnosis import (
     SyntheticModel,
     catalogue,
     explain_without_laws,
-    linearised,
+    linearise_flights,
 )
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
@@ -55,7 +55,7 @@ def table(terms_: list, knots: dict) -> np.ndarray:
     return np.stack([term.read(laws.KnotValues(knots)) for term in terms_], axis=-1)
 
 
-def turned(knots: dict, turn: Rotation) -> dict:
+def turn_world(knots: dict, turn: Rotation) -> dict:
     """The same flight in a turned world."""
     vectors = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "cable_dir_w")
     quats = (turn * Rotation.from_quat(knots["quat_wb"])).as_quat()
@@ -94,7 +94,7 @@ def test_terms_turn_with_the_world(block):
     values = table(every, knots)
     together = laws.table(every, laws.KnotValues(knots))
     assert_allclose(together, values, atol=1e-12 * np.abs(values).max())
-    again = table(every, turned(knots, about))
+    again = table(every, turn_world(knots, about))
     assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
@@ -275,9 +275,11 @@ def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch)
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
-def beside_a_law(model: SyntheticModel, active: list[int], *active_terms: laws.Term) -> Selector:
+def select_beside_law(
+    model: SyntheticModel, active: list[int], *active_terms: laws.Term
+) -> Selector:
     """A selection that holds some names and laws."""
-    point = linearised(model)
+    point = linearise_flights(model)
     if active_terms:
         (point,) = terms.extended(
             [point], [terms.as_effect(term, 0.1, 7.0) for term in active_terms]
@@ -295,7 +297,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block, monkeypatch):
     further simulation. Windows are shared out among threads.
     """
     monkeypatch.setattr("visthrow.diagnose.likelihood.threads.cores", lambda: 2)
-    at = beside_a_law(
+    at = select_beside_law(
         SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )
     best = at.best.point
@@ -316,7 +318,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block, monkeypatch):
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """A term on the law's body may be part of its form; a force on the payload is not."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
-    at = beside_a_law(
+    at = select_beside_law(
         SyntheticModel(law="speed", law_size=0.02, truth=truth, seed=3),
         [3, 6],
         DRAG,
@@ -332,7 +334,7 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     model = SyntheticModel(law="speed", law_size=0.02, seed=3)
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
-    at = beside_a_law(model, [6, 8], DRAG)
+    at = select_beside_law(model, [6, 8], DRAG)
     assert acts_on(at.best.point, at.names) == ["payload force"] * 2
     assert [acts_on(at.best.point, [j], free_effects=[14 - j])[0] for j in at.names] == [
         "vehicle force"
@@ -352,7 +354,7 @@ def test_a_law_of_the_vehicle_may_turn_it_as_well():
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
-    assert verdicts._law(beside_a_law(model, [3, 6], DRAG), [])[3] == {3, 6}
+    assert verdicts._law(select_beside_law(model, [3, 6], DRAG), [])[3] == {3, 6}
 
 
 def test_the_table_takes_up_what_no_name_explains():

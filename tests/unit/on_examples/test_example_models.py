@@ -15,7 +15,7 @@ from examples.pendulum.swing_model import ENCODER, PendulumModel, PendulumParams
 from examples.trim.trim_model import E8, TrimModel
 from tests.flightlogs import log_at
 from tests.places import DATA
-from tests.unit.on_diagnose.test_models import estimate, near
+from tests.unit.on_diagnose.test_models import assert_near, estimate
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting.explain_cli import write_report
@@ -52,7 +52,7 @@ def test_frictions_are_distinguished():
         "encoder_offset": 0.01,
     }
     estimates = estimate(PendulumModel([log], SWING), [*truth])
-    assert all(near(estimates, name, size) for name, size in truth.items()), estimates
+    assert all(assert_near(estimates, name, size) for name, size in truth.items()), estimates
     assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
 
 

@@ -19,7 +19,7 @@ def at(pos, vel) -> BodyState:
     return BodyState(pos, None, vel, (0.0, 0.0, 0.0), 0.0)
 
 
-def fallen(pos, vel, drag):
+def integrate_fall(pos, vel, drag):
     """By an integrator with steps of its own; drag per mass [1/m]."""
 
     def motion(_, y):
@@ -42,7 +42,7 @@ def test_prediction_against_an_integrator(vel, drag):
     landing = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(
         at(pos, vel)
     )
-    assert landing == approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
+    assert landing == approx(integrate_fall(pos, vel, drag / 0.058), abs=2e-3)
 
 
 def test_a_payload_below_the_ground_or_without_end_is_judged():

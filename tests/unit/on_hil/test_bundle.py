@@ -11,20 +11,20 @@ from pytest import approx, fixture, raises
 from hil.control.recording.record import pack
 from hil.errors import RunError
 from tests.commands import run_command
-from tests.hil_runs import record_run, saved_policy
+from tests.hil_runs import record_run, save_policy
 
 LOST = 2.5
 """From which on no pose comes [s]: some ticks later the runner aborts."""
 
 
-def stopped(time, poses):
+def stop(time, poses):
     return poses if time < LOST else []
 
 
 @fixture(scope="module")
 def aborted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "a"
-    decisions = record_run(folder, saved_policy(folder.parent), seconds=6.0, poses=stopped)
+    decisions = record_run(folder, save_policy(folder.parent), seconds=6.0, poses=stop)
     return folder, decisions
 
 
@@ -59,7 +59,7 @@ def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
 
 
 def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, printed):
-    record_run(tmp_path / "b", saved_policy(tmp_path), seconds=2.0, close=False)
+    record_run(tmp_path / "b", save_policy(tmp_path), seconds=2.0, close=False)
     out = printed(f"hil replay {tmp_path}/b", status=1)
     assert "b.zip  what there is of the run" in out
     assert (

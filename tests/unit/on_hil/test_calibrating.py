@@ -133,7 +133,7 @@ class Hall:
             if decision.command is not None:
                 self.command = np.array(decision.command)
 
-    def off(self) -> float:
+    def measure_offset(self) -> float:
         """RMS of the policy's present keypoints from those of the training's camera [-]."""
         _, state = min(self.path, key=lambda row: abs(row[0] - (self.plant.time - 0.01)))
         tensors = [
@@ -154,7 +154,7 @@ def hall():
     params = replace(run_params(), policy="vision_located")
     made = Hall(Runner(params, Policy.load(find_policy(params.policy)), DryRun()))
     made.fly(3.0)
-    made.before = made.off()
+    made.before = made.measure_offset()
     made.fly(9.0)  # still, sway, and until the swing that it leaves has died down
     return made
 
@@ -181,7 +181,7 @@ def test_what_is_shown_to_the_policy_is_corrected(hall):
     After: the noise is left, and the swing of 54 ms.
     """
     assert hall.before > 0.015
-    assert hall.off() < hall.before / 2.5
+    assert hall.measure_offset() < hall.before / 2.5
     assert not hall.runner.calibrating.problems()
 
 

@@ -19,7 +19,7 @@ def estimate(time: float, age: float) -> Estimate:
     return Estimate(time, vehicle, None, None, 0, 0, 0, AGE + age)
 
 
-def carried(ticks=10, rates=lambda n: None, command=STILL) -> DeadReckoning:
+def carry(ticks=10, rates=lambda n: None, command=STILL) -> DeadReckoning:
     reckoning = DeadReckoning()
     for n in range(ticks + 1):
         reckoning.update(estimate(n * TICK, n * TICK), rates(n), command, MASS)
@@ -30,29 +30,29 @@ def carried(ticks=10, rates=lambda n: None, command=STILL) -> DeadReckoning:
 def test_reported_rates_turn_the_attitude(axis):
     """From the time of the pose on; reports differ in a last digit."""
     rates = lambda n: tuple(3.0 + 1e-9 * n if i == axis else 0.0 for i in range(3))  # noqa: E731
-    reckoning = carried(rates=rates)
+    reckoning = carry(rates=rates)
     angle = 2.0 * math.atan2(reckoning.state.quat[axis], reckoning.state.quat[3])
     assert angle == approx(3.0 * (10 * TICK + AGE), abs=2e-3)
     assert reckoning.duration == approx(10 * TICK + AGE)
 
 
 def test_without_reports_the_rates_follow_the_command():
-    reckoning = carried(5, command=(0.0, 2.0, 0.0, 0.0))
+    reckoning = carry(5, command=(0.0, 2.0, 0.0, 0.0))
     share = 1.0 - math.exp(-(5 * TICK + AGE) / RESPONSE)
     assert reckoning.state.rate == approx((2.0 * share, 0.0, 0.0))
 
 
 def test_a_vehicle_without_thrust_falls_and_one_with_its_weight_goes_on():
     time = 10 * TICK + AGE
-    falls = carried().state
+    falls = carry().state
     assert falls.vel == approx((1.0, 0.0, 0.5 - 9.81 * time), abs=1e-3)
-    goes_on = carried(command=(MASS * 9.81, 0.0, 0.0, 0.0)).state
+    goes_on = carry(command=(MASS * 9.81, 0.0, 0.0, 0.0)).state
     assert goes_on.vel == approx((1.0, 0.0, 0.5), abs=1e-3)
     assert goes_on.pos == approx((time, 0.0, 1.3 + 0.5 * time), abs=1e-3)
 
 
 def test_a_new_pose_begins_anew():
-    reckoning = carried()
+    reckoning = carry()
     reckoning.update(estimate(11 * TICK, 0.0), None, STILL, MASS)
     assert reckoning.state.vel == (1.0, 0.0, 0.5)
     assert reckoning.duration == 0.0

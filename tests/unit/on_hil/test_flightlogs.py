@@ -24,7 +24,7 @@ from hil.control.recording.record import load_run
 from hil.control.recording.run_report import finish
 from tests.commands import run_python
 from tests.hil_flight import TICK
-from tests.hil_runs import copy_run, record_run, saved_policy
+from tests.hil_runs import copy_run, record_run, save_policy
 
 LAG = 0.11
 CLOCK = 3e-3
@@ -34,7 +34,7 @@ CLOCK = 3e-3
 @fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
-    decisions = record_run(folder / "a", saved_policy(folder), seconds=6.0)
+    decisions = record_run(folder / "a", save_policy(folder), seconds=6.0)
     return folder / "a", decisions
 
 
@@ -135,7 +135,7 @@ def test_poses_of_a_clock_that_drifts_are_dated_by_their_arrivals(tmp_path):
     def drifting(time, poses):
         return [replace(pose, stamp=1.001 * pose.stamp + 40.0) for pose in poses]
 
-    record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, poses=drifting)
+    record_run(tmp_path / "a", save_policy(tmp_path), seconds=6.0, poses=drifting)
     played = read(tmp_path / "a")
     samples = [sample for tick in played.ticks for sample in tick.samples]
     off = [sample.time - measured(sample, played.playback.params) for sample in samples]

@@ -52,7 +52,7 @@ def test_each_reason(second, reason):
     assert gate.refused == ({} if reason is None else {reason: 1})
 
 
-def turned(angle: float, norm: float = 1.0):
+def turn(angle: float, norm: float = 1.0):
     return (0.0, norm * math.sin(angle / 2.0), 0.0, norm * math.cos(angle / 2.0))
 
 
@@ -61,9 +61,9 @@ def turned(angle: float, norm: float = 1.0):
     [
         (lambda x: pose(0.01, x), 0.12 + 20.0 * 0.01**2, "jump"),  # 0.5 * 40 m/s^2
         (lambda x: pose(0.02, -x), 0.12 + 20.0 * 0.02**2, "jump"),
-        (lambda a: pose(0.01, 0.01, turned(a)), 0.3 + 15.0 * 0.01, "turn"),
-        (lambda a: pose(0.02, 0.01, turned(-a)), 0.3 + 15.0 * 0.02, "turn"),
-        (lambda n: pose(0.01, 0.01, turned(0.0, n)), 1.02, "quaternion"),
+        (lambda a: pose(0.01, 0.01, turn(a)), 0.3 + 15.0 * 0.01, "turn"),
+        (lambda a: pose(0.02, 0.01, turn(-a)), 0.3 + 15.0 * 0.02, "turn"),
+        (lambda n: pose(0.01, 0.01, turn(0.0, n)), 1.02, "quaternion"),
         (lambda v: pose(0.01, 0.01, vel=(0.0, -v, 0.0)), 8.0, "speed"),
     ],
 )

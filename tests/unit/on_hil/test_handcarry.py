@@ -33,7 +33,7 @@ def about(axis, angle):
     return (*vector, math.cos(angle / 2))
 
 
-def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
+def carry(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
     """Poses of a source with these frames, of a vehicle carried about, not quite straight."""
     rng = default_rng(seed)
     pos, quat, track = np.array([0.3, -0.2, 1.0]), about(2, math.radians(rng.uniform(-5, 5))), []
@@ -66,7 +66,7 @@ def made(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw") -> FrameParams:
 @fixture(scope="module")
 def track():
     """Poses in our frames."""
-    return carried(OURS)
+    return carry(OURS)
 
 
 @fixture(scope="module")
@@ -108,9 +108,9 @@ def test_a_left_handed_world_is_reported(track):
 
 def test_moves_that_were_left_out_are_counted():
     with raises(RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"):
-        judge(find_steps(carried(OURS, moves=5)), OURS)
+        judge(find_steps(carry(OURS, moves=5)), OURS)
     with raises(RunError, match="expected 8"):
-        judge(find_steps(carried(OURS, rest=0.2)), OURS)
+        judge(find_steps(carry(OURS, rest=0.2)), OURS)
     assert find_steps([]) == []
     with raises(RunError, match="gives no attitude"):
         find_steps([Pose(0.0, 0.0, "vehicle", (0.0, 0.0, 0.0))])
@@ -132,7 +132,7 @@ def test_a_live_source_asks_for_the_next_move_and_left_when_all_are_made(track):
 @mark.parametrize(("axes", "status"), [("y,x,-z", 0), ("x,-y,-z", 1)])
 def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
     path = tmp_path / "carried.csv"
-    rows = [(p.stamp, *p.pos, *p.quat) for p in carried(made("y,x,-z", "x,-y,-z", "wxyz"))]
+    rows = [(p.stamp, *p.pos, *p.quat) for p in carry(made("y,x,-z", "x,-y,-z", "wxyz"))]
     path.write_text("t,x,y,z,qw,qx,qy,qz\n" + "\n".join(",".join(map(str, row)) for row in rows))
     columns = (
         '[{name="pos_w", columns=["x", "y", "z"], unit="m"}, '

@@ -51,7 +51,7 @@ def test_report_and_picture(tmp_path):
     draw(tmp_path / "empty.png", Stages(), "nothing flown")
 
 
-def watched(*overrides: str, late: float) -> Runner:
+def watch(*overrides: str, late: float) -> Runner:
     """A runner that has taken poses of a vehicle at 1 m/s along x, ``late`` after they held."""
     given = ("delay.compensate=true", "delay.source=0.0", *overrides)
     runner = Runner(params(*given), simple_policy(), Spy())
@@ -71,7 +71,7 @@ def watched(*overrides: str, late: float) -> Runner:
 def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(command):
     """By the time from measurement to arrival of each pose, and the delay of the command."""
     late = 0.03
-    runner = watched(f"delay.command={command}", late=late)
+    runner = watch(f"delay.command={command}", late=late)
     now = 0.39 + late
     estimate = runner.estimator.estimate(now)
     trained = runner.trained_age
@@ -80,7 +80,7 @@ def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(comma
 
 
 def test_a_detector_receives_the_payloads_distance_while_it_hangs():
-    runner = watched(late=0.0)
+    runner = watch(late=0.0)
     hint = runner.estimator.hint(0.39)
     assert hint.ball_distance == approx((0.5 * runner.hang, 1.4 * runner.hang))
     runner.latch.at = 0.39

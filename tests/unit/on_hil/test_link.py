@@ -22,10 +22,10 @@ from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
 from hil.poses.sources.open_source import open_source
 from tests.configs import load_run
-from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
+from tests.fuzz import EACH, SEEDS, any_message, mutate, noise
 
 
-def packed(message) -> bytes:
+def pack(message) -> bytes:
     return message.pack(mav.MAVLink(None, 1, 1))
 
 
@@ -55,13 +55,13 @@ def fuzz(count: int, seed: int) -> None:
     the fields of poses.
     """
     rng = np.random.default_rng(seed)
-    good, whole, stream = [packed(message) for message in MESSAGES], Parser(), Parser()
+    good, whole, stream = [pack(message) for message in MESSAGES], Parser(), Parser()
     parsed = 0
     for i in range(count):
         if rng.random() < 0.3:
             data = noise(rng)
         else:
-            data = any_message(rng, POSES) if i % 2 else mutated(rng, good)
+            data = any_message(rng, POSES) if i % 2 else mutate(rng, good)
         for message in whole.parse(data) + stream.parse(data, whole=False):
             pose_from_message(message, "vehicle", 0.0)
             parsed += 1
@@ -75,20 +75,20 @@ def test_no_bytes_make_the_parser_raise():
 
 
 def test_a_cut_datagram_does_not_spoil_the_next():
-    parser, good = Parser(), packed(MESSAGES[0])
+    parser, good = Parser(), pack(MESSAGES[0])
     assert parser.parse(good[:20]) == []
     assert [m.get_type() for m in parser.parse(good)] == ["ATT_POS_MOCAP"]
     assert [m.get_type() for m in parser.parse(good + good)] == ["ATT_POS_MOCAP"] * 2
 
 
 def test_a_stream_is_put_together():
-    parser, good = Parser(), packed(MESSAGES[0])
+    parser, good = Parser(), pack(MESSAGES[0])
     assert parser.parse(good[:20], whole=False) == []
     assert len(parser.parse(good[20:], whole=False)) == 1
 
 
 def test_messages_are_of_version_2():
-    assert packed(MESSAGES[0])[0] == mav.PROTOCOL_MARKER_V2
+    assert pack(MESSAGES[0])[0] == mav.PROTOCOL_MARKER_V2
     assert os.environ["MAVLINK20"] == "1"
 
 
@@ -171,7 +171,7 @@ def test_what_the_fields_mean():
 
 def test_the_command_on_the_wire():
     sent = attitude_target(12.3456, (1, 2), 0.5, (1.0, -2.0, 3.0))
-    (got,) = Parser().parse(packed(sent))
+    (got,) = Parser().parse(pack(sent))
     assert (got.target_system, got.target_component, got.type_mask, got.q) == (
         1,
         2,
@@ -200,7 +200,7 @@ def test_both_ways_over_loopback_and_the_tlog_reads_back(tmp_path):
     assert peer.send(MESSAGES[0])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         ours.pump(lambda: 1.5)
-        stranger.sendto(packed(MESSAGES[2]), ("127.0.0.1", number))
+        stranger.sendto(pack(MESSAGES[2]), ("127.0.0.1", number))
         ours.pump(lambda: 2.5)
     assert heard == [("ATT_POS_MOCAP", 1.5)], "a stranger is not heard"
     assert ours.send(attitude_target(0.0, (1, 1), 0.5, (0.0, 0.0, 0.0)))
@@ -231,7 +231,7 @@ def test_a_device_that_names_its_peer_hears_nobody_else():
     peer.pump(lambda: 0.0)
     (address,) = peer.roster.at.values()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        stranger.sendto(packed(MESSAGES[2]), address)
+        stranger.sendto(pack(MESSAGES[2]), address)
         peer.send(MESSAGES[0])
         ours.pump(lambda: 0.0)
         assert heard == ["ATT_POS_MOCAP"]

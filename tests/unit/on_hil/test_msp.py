@@ -8,7 +8,7 @@ from pytest import mark, raises
 from hil.links import msp
 from hil.links.backends.betaflight import BOX_ARM, Betaflight, settings
 from tests.configs import load_run
-from tests.fuzz import EACH, SEEDS, mutated, noise
+from tests.fuzz import EACH, SEEDS, mutate, noise
 from tests.loopback.wire import pipe
 
 HELLO = msp.Frame(
@@ -74,7 +74,7 @@ def fuzz(count: int, seed: int) -> None:
         for c in range(256)
     ]
     for i in range(count):
-        here.inbox.append(mutated(rng, seeds) if rng.random() < 0.8 else noise(rng))
+        here.inbox.append(mutate(rng, seeds) if rng.random() < 0.8 else noise(rng))
         if i % 50 == 0:
             backend.service(0.01 * i)
             backend.status(0.01 * i)

@@ -88,7 +88,7 @@ def test_each_wrong_unit_is_named(name, units, message):
     assert re.search(message, problems(flight(name, **units)))
 
 
-def flown(angle: float) -> list[Pose]:
+def swing(angle: float) -> list[Pose]:
     """A vehicle that swings to and fro, tilting as it must, its angles multiplied by a factor."""
     poses = []
     for i in range(600):
@@ -109,9 +109,9 @@ def flown(angle: float) -> list[Pose]:
 
 def test_a_multirotor_tilts_where_it_accelerates():
     frames = flight("slungload_log").frames
-    assert unit_problems(flown(1.0), frames) == []
-    assert "times the first: one is in degrees" in unit_problems(flown(np.pi / 180), frames)[0]
-    assert "degrees taken for radians" in unit_problems(flown(180 / np.pi), frames)[0]
+    assert unit_problems(swing(1.0), frames) == []
+    assert "times the first: one is in degrees" in unit_problems(swing(np.pi / 180), frames)[0]
+    assert "degrees taken for radians" in unit_problems(swing(180 / np.pi), frames)[0]
 
 
 def test_little_data_and_a_still_vehicle_say_nothing():

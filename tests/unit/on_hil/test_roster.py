@@ -7,7 +7,7 @@ from pytest import mark, raises
 from hil.errors import LinkError
 from hil.links.pymav import mav
 from hil.links.roster import MOST_KEPT, SILENT, SIMULATED, Party, Roster, check_allowed
-from tests.loopback.wire import wired
+from tests.loopback.wire import pass_wire
 from tests.unit.on_hil.test_sources import mocap, odometry
 
 AUTOPILOT = Party("autopilot", 1, 1, autopilot=mav.MAV_AUTOPILOT_PX4)
@@ -17,11 +17,11 @@ A, B, C = ("127.0.0.1", 1001), ("127.0.0.1", 1002), ("10.0.0.9", 14550)
 
 
 def beat(autopilot=mav.MAV_AUTOPILOT_PX4, **ids):
-    return wired(mav.MAVLink_heartbeat_message(2, autopilot, 0, 0, 0, 3), **ids)
+    return pass_wire(mav.MAVLink_heartbeat_message(2, autopilot, 0, 0, 0, 3), **ids)
 
 
 def pose(**ids):
-    return wired(mocap(), **ids)
+    return pass_wire(mocap(), **ids)
 
 
 def roster(*parties, **more):
@@ -34,12 +34,12 @@ def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
     who, messages = roster()
     assert who.admit(pose(), A, 0.0)
     assert who.admit(beat(), B, 0.1)
-    assert who.admit(wired(odometry(), system=42, component=7), A, 0.2)
+    assert who.admit(pass_wire(odometry(), system=42, component=7), A, 0.2)
     assert who.at == {"vehicle": A, "autopilot": B, "payload": A}
     assert (who.refused, messages) == (0, [])
     assert who.addresses(mav.MAVLink_command_long_message(1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0)) == (B,)
     assert set(who.addresses(mav.MAVLink_timesync_message(0, 1))) == {A, B}
-    sync = wired(mav.MAVLink_timesync_message(5, 6))
+    sync = pass_wire(mav.MAVLink_timesync_message(5, 6))
     assert who.admit(sync, A, 0.3), "either clock of system 1"
     assert who.admit(sync, B, 0.3)
     assert not who.admit(sync, C, 0.3)
@@ -47,7 +47,7 @@ def test_poses_and_autopilot_of_the_same_ids_come_from_two_senders():
 
 def test_an_autopilot_is_heard_from_its_first_right_heartbeat_on():
     who, messages = roster(AUTOPILOT)
-    other = wired(mav.MAVLink_sys_status_message(0, 0, 0, 0, 12000, 0, 0, 0, 0, 0, 0, 0, 0))
+    other = pass_wire(mav.MAVLink_sys_status_message(0, 0, 0, 0, 12000, 0, 0, 0, 0, 0, 0, 0, 0))
     assert not who.admit(other, A, 0.0)
     assert not who.admit(beat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA), A, 0.1)
     assert not who.at
@@ -147,7 +147,7 @@ def test_no_flood_fills_the_memory():
 
 def test_a_fake_says_that_it_is_one():
     who, _ = roster()
-    word = wired(mav.MAVLink_named_value_int_message(0, SIMULATED.encode(), 1))
+    word = pass_wire(mav.MAVLink_named_value_int_message(0, SIMULATED.encode(), 1))
     assert not who.admit(word, A, 0.0)
     assert not who.simulated
     who.admit(pose(), A, 0.0)

@@ -36,7 +36,7 @@ def safe(pilot: Runner, decisions) -> None:
     assert all(d.state == "throw" for d in decisions if d.release)
 
 
-def thrown(*args, action=AT_ONCE, overrides=(), seconds=12.0, **kwargs):
+def throw(*args, action=AT_ONCE, overrides=(), seconds=12.0, **kwargs):
     pilot = runner(action, *overrides)
     decisions = fly(pilot, seconds, **kwargs)
     safe(pilot, decisions)
@@ -48,7 +48,7 @@ def when(decisions, state: str) -> float:
 
 
 def test_a_throw_from_idle_to_done():
-    pilot, decisions = thrown(seconds=20.0)
+    pilot, decisions = throw(seconds=20.0)
     assert [state for state, _ in changes(decisions)] == [
         "idle",
         "check",
@@ -74,7 +74,7 @@ def test_a_throw_from_idle_to_done():
 
 def test_one_word_of_the_operator_is_one_throw():
     words = lambda time, state: OperatorInput(arm=state == "ready" and time < 3)  # noqa: E731
-    pilot, decisions = thrown(overrides=("throws=2",), seconds=20.0, words=words)
+    pilot, decisions = throw(overrides=("throws=2",), seconds=20.0, words=words)
     assert decisions[-1].state == "ready"
     assert len(pilot.backend.release_times) == 1
 
@@ -83,7 +83,7 @@ START = 3.0  # the policy that never releases throws from about 2.1 s to 7.1 s
 
 
 def test_a_body_that_was_reset_on_the_ground_is_taken_again():
-    _, decisions = thrown(
+    _, decisions = throw(
         action=NEVER,
         poses=lambda t, poses: [replace(p, reset=int(t > 0.5)) for p in poses],
         status=lambda t: Status(t > 2.5),
@@ -93,13 +93,13 @@ def test_a_body_that_was_reset_on_the_ground_is_taken_again():
 
 
 def test_a_payload_that_reappears_in_its_fall_is_farther_off_than_its_cable():
-    latch = next(d.time for d in thrown()[1] if d.release)
+    latch = next(d.time for d in throw()[1] if d.release)
 
     def blink(time, poses):
         gone = latch + LAG + 0.05 < time < latch + LAG + 0.25
         return [p for p in poses if not (gone and p.body == "payload")]
 
-    pilot, _ = thrown(poses=blink)
+    pilot, _ = throw(poses=blink)
     assert pilot.tracks["payload"].gate.refused == {}
     assert len(pilot.latch.landings) == 1
 
@@ -144,7 +144,7 @@ def test_a_payload_that_rolls_on_after_its_landing_keeps_no_vehicle_from_being_c
         way = max(time - START, 0.0)
         return [replace(p, pos=(p.pos[0] + way * (p.body == "payload"), *p.pos[1:])) for p in poses]
 
-    _, decisions = thrown(poses=roll, seconds=9.0)
+    _, decisions = throw(poses=roll, seconds=9.0)
     assert "hovering again" in {reason for _, reason in changes(decisions)}
 
 
@@ -185,7 +185,7 @@ def test_the_checks_before_a_throw(overrides, message):
         vehicle, payload = poses
         return [replace(vehicle, body=payload.body), replace(payload, body=vehicle.body)]
 
-    pilot, decisions = thrown(overrides=(*overrides, "states.check=1.5"), seconds=4.0, poses=poses)
+    pilot, decisions = throw(overrides=(*overrides, "states.check=1.5"), seconds=4.0, poses=poses)
     state, reason = changes(decisions)[2]
     assert state == "abort"
     assert any(word in reason for word in message.split("|")), reason
@@ -209,7 +209,7 @@ def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_visible(x):
         )
 
     overrides = (GOAL, "goal_w=[9.0, 0.0, 0.0]", "states.check=1.5")
-    _, decisions = thrown(overrides=overrides, seconds=4.0, poses=with_goal)
+    _, decisions = throw(overrides=overrides, seconds=4.0, poses=with_goal)
     state, reason = changes(decisions)[2]
     assert (state, "goal x 9.00 m beyond" in reason) == (
         ("ready", False) if x == 2.0 else ("abort", True)
@@ -229,7 +229,7 @@ def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
             replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload"))) for p in poses
         ]
 
-    pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=START + 0.6)
+    pilot, decisions = throw(action=NEVER, poses=spoil, seconds=START + 0.6)
     assert pilot.tracks["vehicle"].gate.refused == {}
     assert changes(decisions)[-1] == ("recover", "the payload has come off by itself")
     assert when(decisions, "recover") < begun + 0.2, "a fall of the tolerance, 10 cm"
@@ -261,7 +261,7 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     assert any(f"the pictures show no {name}" in d.waits for d in decisions)
 
 
-def broken_policy(pilot: Runner, act):
+def break_policy(pilot: Runner, act):
     """Replace what the policy does from `START` on; returns what watches a flight for that."""
 
     def watch(time, decision):
@@ -285,7 +285,7 @@ def not_finite(pilot: Runner, value: float):
 @mark.parametrize("value", [math.nan, math.inf])
 def test_a_policy_that_puts_out_no_numbers(value):
     pilot = runner(NEVER)
-    decisions = fly(pilot, 5.0, watch=broken_policy(pilot, not_finite(pilot, value)))
+    decisions = fly(pilot, 5.0, watch=break_policy(pilot, not_finite(pilot, value)))
     safe(pilot, decisions)
     assert "is not finite" in changes(decisions)[-1][1]
     assert not pilot.backend.release_times, "what it says of the release counts for nothing either"
@@ -296,7 +296,7 @@ def test_a_policy_that_puts_out_no_numbers(value):
 def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
     """Pitching slowly, the vehicle has gone some way ahead when the policy's numbers end."""
     pilot = runner((HOVER, 0.0, 0.02, 0.0, -1.0))
-    spoil, places = broken_policy(pilot, not_finite(pilot, math.nan)), []
+    spoil, places = break_policy(pilot, not_finite(pilot, math.nan)), []
 
     def watch(time, decision):
         spoil(time, decision)
@@ -314,7 +314,7 @@ def test_no_exception_leaves_the_runner():
     def broken(*args):
         raise ZeroDivisionError("in flight")
 
-    decisions = fly(pilot, 5.0, watch=broken_policy(pilot, broken))
+    decisions = fly(pilot, 5.0, watch=break_policy(pilot, broken))
     safe(pilot, decisions)
     assert changes(decisions)[-1] == ("abort", "ZeroDivisionError: in flight")
     assert "in flight" in pilot.errors[0]
@@ -324,7 +324,7 @@ OUTSIDE = {"vehicle_high": (-0.5, 2.5, 2.8)}
 """Bounds that the vehicle is beyond [m]."""
 
 
-def narrowed(pilot, state, bounds):
+def narrow_fence(pilot, state, bounds):
     """Return what gives the fence other bounds [m] from a state on."""
     tight = replace(pilot.params.fence, **bounds)
 
@@ -341,7 +341,7 @@ def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
     It comes down at once, and says why.
     """
     pilot = runner(AT_ONCE, "throws=2")
-    decisions = fly(pilot, 20.0, watch=narrowed(pilot, "recover", OUTSIDE))
+    decisions = fly(pilot, 20.0, watch=narrow_fence(pilot, "recover", OUTSIDE))
     safe(pilot, decisions)
     assert [state for state, _ in changes(decisions)][-4:] == ["throw", "recover", "land", "done"]
     assert when(decisions, "land") - when(decisions, "recover") <= 2 * TICK
@@ -352,7 +352,7 @@ def test_a_fence_that_is_left_after_the_throw_lands_and_is_no_abort():
 
 def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     pilot = runner(NEVER, "states.throw=1.0")
-    decisions = fly(pilot, 20.0, watch=narrowed(pilot, "recover", OUTSIDE))
+    decisions = fly(pilot, 20.0, watch=narrow_fence(pilot, "recover", OUTSIDE))
     safe(pilot, decisions)
     assert dict(changes(decisions))["recover"] == "the policy did not release in time"
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
@@ -394,7 +394,9 @@ def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
 def test_a_release_outside_of_the_fence_is_refused():
     """The payload hangs outside of its fence from the policy's release request on."""
     pilot = runner(AT_ONCE)
-    decisions = fly(pilot, 5.0, watch=narrowed(pilot, "armed", {"payload_low": (-3.0, -3.0, 1.2)}))
+    decisions = fly(
+        pilot, 5.0, watch=narrow_fence(pilot, "armed", {"payload_low": (-3.0, -3.0, 1.2)})
+    )
     safe(pilot, decisions)
     assert not pilot.backend.release_times
 
@@ -453,13 +455,13 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
         low = replace(payload, pos=(x, y, z - 0.4))
         return [vehicle] if time <= START + gap else [vehicle, low]
 
-    pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
+    pilot, _ = throw(action=NEVER, poses=spoil, seconds=START + 0.4)
     assert pilot.tracks["payload"].gate.refused["cable"] > 10
 
 
 def test_without_poses_it_is_levelled_and_falls_silent_in_the_end():
     gone = lambda time, poses: poses if time <= START else []  # noqa: E731
-    _, decisions = thrown(action=NEVER, poses=gone, seconds=6.0)
+    _, decisions = throw(action=NEVER, poses=gone, seconds=6.0)
     levelled = [d for d in decisions if d.note.startswith("level")]
     assert levelled[0].command[1:] == approx((0.0, 0.0, 0.0), abs=0.2)
     assert decisions[-1].command is None, "the autopilot's failsafes act"

@@ -33,7 +33,7 @@ def body(pos=MIDDLE, vel=(0.0, 0.0, 0.0)) -> BodyState:
     return BodyState(pos, (0.0, 0.0, 0.0, 1.0), vel, (0.0, 0.0, 0.0), 0.0)
 
 
-def moved(axis: int, value: float, start=MIDDLE) -> tuple[float, ...]:
+def move(axis: int, value: float, start=MIDDLE) -> tuple[float, ...]:
     return tuple(value if i == axis else x for i, x in enumerate(start))
 
 
@@ -43,13 +43,13 @@ def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
     limit = (FENCE.vehicle_low if side < 0 else FENCE.vehicle_high)[axis]
     distance = 0.4
     speed = math.sqrt(2.0 * DECELERATION * distance)  # stops within the distance exactly
-    still = moved(axis, limit - side * distance)
+    still = move(axis, limit - side * distance)
     for factor, broken in ((0.99, False), (1.01, True)):
-        vehicle = body(still, moved(axis, side * speed * factor, (0.0, 0.0, 0.0)))
+        vehicle = body(still, move(axis, side * speed * factor, (0.0, 0.0, 0.0)))
         reason = fence_violation(FENCE, vehicle, None)
         assert bool(reason) is broken, (axis, side, factor)
         assert not broken or "braking point" in reason
-    away = body(still, moved(axis, -side * speed * 1.01, (0.0, 0.0, 0.0)))
+    away = body(still, move(axis, -side * speed * 1.01, (0.0, 0.0, 0.0)))
     assert fence_violation(FENCE, away, None) is None, "moving away from the wall is no danger"
 
 
@@ -62,7 +62,7 @@ def test_vehicle_and_payload_have_separate_boxes(axis, side):
     ):
         limit = (low if side < 0 else high)[axis]
         for shift, broken in ((-NEAR, False), (NEAR, True)):
-            place = body(moved(axis, limit + side * shift))
+            place = body(move(axis, limit + side * shift))
             vehicle, payload = (place, None) if name == "vehicle" else (body(), place)
             reason = fence_violation(FENCE, vehicle, payload)
             assert bool(reason) is broken, (name, axis, side, shift)

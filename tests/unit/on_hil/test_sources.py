@@ -18,7 +18,7 @@ from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.poses.sources.player import read_table, read_tlog
 from hil.poses.sources.pose_source import RecordedSource
 from tests.configs import load_run
-from tests.loopback.wire import pipe, wired
+from tests.loopback.wire import pass_wire, pipe
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -41,21 +41,21 @@ def local_position(time_ms=1000):
 
 def test_bodies_are_distinguished_by_their_senders():
     decoder = MavlinkDecoder(BODIES)
-    assert decoder.feed(wired(mocap(), 1, 9), 0.0).body == "vehicle"
-    assert decoder.feed(wired(mocap(), 2, 1), 0.0) is None
-    assert decoder.feed(wired(odometry(), 2, 1), 0.0).body == "payload"
-    assert decoder.feed(wired(odometry(), 2, 2), 0.0) is None
-    assert decoder.feed(wired(mav.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3)), 0.0) is None
+    assert decoder.feed(pass_wire(mocap(), 1, 9), 0.0).body == "vehicle"
+    assert decoder.feed(pass_wire(mocap(), 2, 1), 0.0) is None
+    assert decoder.feed(pass_wire(odometry(), 2, 1), 0.0).body == "payload"
+    assert decoder.feed(pass_wire(odometry(), 2, 2), 0.0) is None
+    assert decoder.feed(pass_wire(mav.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3)), 0.0) is None
 
 
 def test_a_local_position_takes_the_attitude_of_its_sender():
     decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
-    local = wired(local_position())
+    local = pass_wire(local_position())
     assert decoder.feed(local, 0.0) is None, "no attitude yet"
     attitude = mav.MAVLink_attitude_quaternion_message(990, 1.0, 0.0, 0.0, 0.0, 0.25, 0.5, 0.75)
-    decoder.feed(wired(attitude, 3, 1), 0.0)
+    decoder.feed(pass_wire(attitude, 3, 1), 0.0)
     assert decoder.feed(local, 0.0) is None, "another sender's"
-    decoder.feed(wired(attitude), 0.0)
+    decoder.feed(pass_wire(attitude), 0.0)
     pose = decoder.feed(local, 0.5)
     assert pose == Pose(
         1.0,
@@ -66,23 +66,23 @@ def test_a_local_position_takes_the_attitude_of_its_sender():
         (4.0, 5.0, 6.0),
         (0.25, 0.5, 0.75),
     )
-    assert decoder.feed(wired(local_position(1100)), 0.0) is None, "too old an attitude"
+    assert decoder.feed(pass_wire(local_position(1100)), 0.0) is None, "too old an attitude"
 
 
 def test_a_local_position_takes_angles_as_well():
     """ArduPilot streams ATTITUDE, and ATTITUDE_QUATERNION only on request."""
     decoder = MavlinkDecoder((BodyIds("vehicle", "LOCAL_POSITION_NED", 1, 1),))
     decoder.feed(
-        wired(mav.MAVLink_attitude_message(990, 0.0, 0.0, math.pi / 2, 0.1, 0.2, 0.3)), 0.0
+        pass_wire(mav.MAVLink_attitude_message(990, 0.0, 0.0, math.pi / 2, 0.1, 0.2, 0.3)), 0.0
     )
-    pose = decoder.feed(wired(local_position()), 0.5)
+    pose = decoder.feed(pass_wire(local_position()), 0.5)
     assert pose.quat == approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
     assert pose.rate == approx((0.1, 0.2, 0.3))
 
 
 def test_an_estimate_that_failed_is_no_pose():
     decoder = MavlinkDecoder((BodyIds("vehicle", "ODOMETRY", 1, 1),))
-    valid = [decoder.feed(wired(odometry(quality=q)), 0.0).valid for q in (-1, 0, 1, 100)]
+    valid = [decoder.feed(pass_wire(odometry(quality=q)), 0.0).valid for q in (-1, 0, 1, 100)]
     assert valid == [False, True, True, True]
 
 
@@ -109,7 +109,7 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
         roster = Roster()
         writer = TlogWriter(tmp_path / "x.tlog")
         for message, component in packed:
-            writer.write(wired(message, 1, component))
+            writer.write(pass_wire(message, 1, component))
         writer.close()
         assert read_tlog(tmp_path / "x.tlog", senders, roster) == []
     reasons = {entry.why: count for entry, count in roster.received.items() if entry.why}
@@ -132,7 +132,7 @@ def test_senders_that_clash_are_refused():
 
 def test_a_slow_disk_holds_up_no_message(tmp_path, monkeypatch):
     monkeypatch.setattr("hil.links.writer.MOST_WAITING", 30)
-    path, turning, message = tmp_path / "a.tlog", threading.Event(), wired(mocap(0, 0.0))
+    path, turning, message = tmp_path / "a.tlog", threading.Event(), pass_wire(mocap(0, 0.0))
     writer = TlogWriter(path)
     file = writer._file
 
@@ -157,7 +157,7 @@ def test_a_tlog_gives_what_the_link_gave_past_damage(tmp_path):
     path = tmp_path / "a.tlog"
     writer, decoder, live = TlogWriter(path), MavlinkDecoder(BODIES), []
     for i in range(20):
-        message = wired(mocap(1000 * i, 0.1 * i))
+        message = pass_wire(mocap(1000 * i, 0.1 * i))
         writer.write(message, 100.0 + 0.01 * i)
         live.append(decoder.feed(message, 0.01 * i))
     writer.close()

@@ -78,7 +78,7 @@ def test_a_clock_that_is_set_is_noticed(step):
     assert sync.steps == 1
 
 
-def dated(offset, stamp_offset=None):
+def date_poses(offset, stamp_offset=None):
     """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet
     another clock.
     """
@@ -107,7 +107,7 @@ def dated(offset, stamp_offset=None):
 
 @mark.parametrize("offset", [0.0, 1.7e9, 333.25])
 def test_poses_are_dated_by_their_senders_clock(offset):
-    poses, sync, _ = dated(offset)
+    poses, sync, _ = date_poses(offset)
     known = [pose for pose in poses if pose.measured is not None]
     assert len(known) > 150
     assert all(abs(pose.transit(9.9) - 0.01) <= 1e-5 for pose in known[20:])
@@ -115,7 +115,7 @@ def test_poses_are_dated_by_their_senders_clock(offset):
 
 
 def test_stamps_of_another_clock_are_not_believed():
-    poses, sync, _ = dated(0.0, stamp_offset=55.0)
+    poses, sync, _ = date_poses(0.0, stamp_offset=55.0)
     assert all(pose.measured is None and pose.transit(0.01) == 0.01 for pose in poses)
     assert sync.foreign > 100
     assert LATE < 1.0, "a clock that was set by a second is another clock"

@@ -272,7 +272,7 @@ def test_a_pose_stream_of_another_clock_is_reported():
     assert row.figures["delay_s"] == approx(0.035, abs=0.002)
 
 
-def carrying() -> dict[str, np.ndarray]:
+def carry_payload() -> dict[str, np.ndarray]:
     """Columns of a vehicle that carries a payload along a smooth path, on a cable without mass."""
     time = np.arange(0.0, 10.0, 0.01)
     below = 0.5 * np.sin(np.outer(time, [1.9, 2.3, 1.1]) + [0.0, 1.0, 2.0]) + [0, 0, 2]
@@ -291,7 +291,7 @@ def carrying() -> dict[str, np.ndarray]:
 
 
 def test_positions_with_exchanged_axes_are_caught_below_a_payload():
-    columns = carrying()
+    columns = carry_payload()
     assert not faults(log_of(columns))
     swapped = {n: columns[n][:, [1, 0, 2]] for n in ("pos_w", "payload_pos_w")}
     assert "fit with (y,x,z) of positions" in faults(log_of(columns | swapped))
@@ -343,7 +343,7 @@ def test_commands_that_oppose_a_swing_are_not_late():
     ],
 )
 def test_a_payload_that_leaves_before_its_command_is_reported(late, step, reported):
-    columns = carrying()
+    columns = carry_payload()
     gone = np.maximum(columns["time"] - 6.0, 0.0)
     columns["payload_pos_w"] -= np.outer(gone, [2.4, 0.0, 3.2])
     stamps = np.arange(step - 0.01, 10.0, step)
@@ -353,7 +353,7 @@ def test_a_payload_that_leaves_before_its_command_is_reported(late, step, report
 
 
 def test_a_payload_that_waits_on_the_floor_does_not_leave_before_its_command():
-    columns = carrying()
+    columns = carry_payload()
     time = columns["time"]
     floor = time < 6.0
     columns["payload_pos_w"][floor] = columns["pos_w"][floor] + [0.15, 0.0, 0.0]

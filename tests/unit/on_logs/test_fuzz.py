@@ -129,7 +129,7 @@ WORDS = (
 )
 
 
-def damaged(data: bytes, chance: random.Random) -> bytes:
+def damage(data: bytes, chance: random.Random) -> bytes:
     """Bytes cut off, turned over, left out, doubled or replaced, now and then in the
     file's head.
     """
@@ -157,7 +157,7 @@ def damaged(data: bytes, chance: random.Random) -> bytes:
     return bytes(out)
 
 
-def looked_at(path: Path) -> bool:
+def is_readable(path: Path) -> bool:
     """Read and check a file; False where an error says why not."""
     mapping = setups.load("cf_payload").table if path.name.startswith("payload") else None
     message = ""
@@ -175,12 +175,12 @@ def all_of(name: str, folder: Path, count: int) -> list[bool]:
     path, chance = folder / name, random.Random(name)
     FORMATS[name](path)
     whole = path.read_bytes()
-    assert looked_at(path)
+    assert is_readable(path)
     readable = []
     for i in range(count):
         cut = whole[: len(whole) * i // (count // 3)]  # a third of them cut short, evenly
-        path.write_bytes(cut if i < count // 3 else damaged(whole, chance))
-        readable.append(looked_at(path))
+        path.write_bytes(cut if i < count // 3 else damage(whole, chance))
+        readable.append(is_readable(path))
     return readable
 
 

@@ -46,7 +46,7 @@ def bits(value: int, count: int) -> str:
     return format(value & (1 << count) - 1, f"0{count}b")
 
 
-def packed(text: str) -> bytes:
+def pack(text: str) -> bytes:
     text += "0" * (-len(text) % 8)
     return bytes(int(text[i : i + 8], 2) for i in range(0, len(text), 8))
 
@@ -84,7 +84,7 @@ class TestCodec:
     @mark.parametrize(("code", "data", "values"), FORMS["codes"])
     def test_three_fields_with_a_selector(self, code, data, values):
         code = getattr(blackbox_codec, f"TAG2_{code}")
-        assert self.decode(code, packed(data.replace(" ", "")), 3) == values
+        assert self.decode(code, pack(data.replace(" ", "")), 3) == values
 
     def test_four_fields_of_nibbles(self):
         chance, widths = random.Random(3), (0, 4, 8, 16)
@@ -95,7 +95,7 @@ class TestCodec:
                 for w in (widths[k] for k in kinds)
             ]
             tag = sum(kind << 2 * i for i, kind in enumerate(kinds))
-            data = bytes([tag]) + packed(
+            data = bytes([tag]) + pack(
                 "".join(bits(v, widths[k]) for v, k in zip(values, kinds) if k)
             )
             assert self.decode(blackbox_codec.TAG8_4S16, data, 4) == values

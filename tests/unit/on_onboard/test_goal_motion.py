@@ -12,14 +12,14 @@ from pytest import approx
 
 from camera.keypoints import KeypointCamera, keypoints
 from tests.configs import load_experiment
-from tests.unit.on_onboard.test_located import followed
+from tests.unit.on_onboard.test_located import follow
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 
 PERIOD = 0.02
 
 
-def fitted(positions: torch.Tensor, sigma: float) -> torch.Tensor:
+def fit_velocity(positions: torch.Tensor, sigma: float) -> torch.Tensor:
     """Velocity after all steps; positions: (T, E, 2)."""
     sums = goal_motion.empty_sums(positions.shape[1])
     fresh = torch.ones(positions.shape[1], dtype=torch.bool)
@@ -40,7 +40,7 @@ def test_equals_the_least_squares_line_with_a_prior():
     normal = design.T @ design / sigma**2 + np.diag([0.0, goal_motion.SPEED_SIGMA**-2])
     slope = np.linalg.solve(normal, design.T @ places / sigma**2)[1]
     moving = torch.tensor(np.column_stack((places, -places)), dtype=torch.float32)[:, None]
-    assert_allclose(fitted(moving, sigma)[0].numpy(), [slope, -slope], rtol=2e-3)
+    assert_allclose(fit_velocity(moving, sigma)[0].numpy(), [slope, -slope], rtol=2e-3)
 
 
 def test_a_new_throw_forgets_the_last_one_and_an_unseen_goal_changes_nothing():
@@ -82,7 +82,7 @@ def test_a_located_state_layout_has_the_mean_goal():
     frames = torch.zeros(10, 1, layout.frame)
     frames[:, 0, :2] = torch.tensor(places)
     frames[:, 0, ob.VEHICLE : ob.VEHICLE + 2] = torch.tensor(goals - places)
-    for step, estimate in enumerate(followed(layout, frames, None, None)):
+    for step, estimate in enumerate(follow(layout, frames, None, None)):
         assert torch.equal(estimate.frame, frames[step])
         expected = np.mean(goals[: step + 1], axis=0) - places[step]
         assert_allclose(estimate.places[0].numpy(), expected, atol=1e-5)

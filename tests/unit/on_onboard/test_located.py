@@ -47,7 +47,7 @@ def places(layout, frame, valid, camera):
     )[2]
 
 
-def followed(layout, frames, valid, camera):
+def follow(layout, frames, valid, camera):
     """Estimates of the goal over the frames of a throw."""
     count = len(frames[0])
     sums, fresh = goal_motion.empty_sums(count), torch.ones(count, dtype=torch.bool)
@@ -62,7 +62,7 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     layout, camera, frame, valid, offset, _ = scene()
     off = []
     frames = [frame + 0.01 * torch.randn_like(frame) for _ in range(40)]
-    for noisy, estimate in zip(frames, followed(layout, frames, valid, camera)):
+    for noisy, estimate in zip(frames, follow(layout, frames, valid, camera)):
         located = estimate.places
         off.append((located[:, :2] + noisy[:, :2] - frame[:, :2] - offset).norm(dim=-1))
     fresh = torch.zeros(8, dtype=torch.bool)
@@ -85,7 +85,7 @@ def test_a_goal_that_moves_is_where_it_is_now():
         60, 1, 1
     )  # the vehicle moves with the goal: its observations do not change
     frames[:, :, :2] += 0.02 * torch.arange(60.0)[:, None, None] * speed
-    *_, (_, velocity, located, _, _) = followed(layout, frames, valid, camera)
+    *_, (_, velocity, located, _, _) = follow(layout, frames, valid, camera)
     assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
     assert_close(located[:, :2], offset, rtol=0, atol=0.02)
 

@@ -37,7 +37,7 @@ def responsive():
     )
 
 
-def flown(times, timed=True, policy=None):
+def fly_pilot(times, timed=True, policy=None):
     """Observations of a pilot whose steps come at some times [periods]."""
     pilot = Pilot(policy or simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0)))
     return [observe(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
@@ -55,9 +55,9 @@ def flown(times, timed=True, policy=None):
     ],
 )
 def test_a_history_with_gaps_is_that_of_regular_steps(times):
-    even = flown(range(7), timed=False)
-    assert_allclose(flown(times), even, atol=2e-6)
-    assert np.abs(flown(times, timed=False) - even).max() > 5e-3, "without the times it is not"
+    even = fly_pilot(range(7), timed=False)
+    assert_allclose(fly_pilot(times), even, atol=2e-6)
+    assert np.abs(fly_pilot(times, timed=False) - even).max() > 5e-3, "without the times it is not"
 
 
 @mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_history_with_gaps_is_that_of_regular_steps(times):
 )
 def test_a_response_with_gaps_is_that_of_regular_steps(times):
     speeds = [
-        flown(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
+        fly_pilot(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
         for t, timed in ((times, True), (range(times[-1] + 1), False), (times, False))
     ]
     assert_allclose(speeds[0], speeds[1], atol=2e-6)

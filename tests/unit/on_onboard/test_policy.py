@@ -104,7 +104,7 @@ def test_each_difference_is_named_with_both_values(policy):
     policy.require(now, sections=("action",))
 
 
-def rewritten(path, change):
+def rewrite(path, change):
     """Return the file's arrays after ``change(arrays, header)``, written back."""
     arrays = dict(np.load(path))
     header = from_json_array(arrays["header"])
@@ -142,7 +142,7 @@ def rewritten(path, change):
 def test_incomplete_or_contradictory_files_are_refused(policy, tmp_path, change, message):
     path = tmp_path / "p.npz"
     policy.save(path)
-    rewritten(path, change)
+    rewrite(path, change)
     with raises(PolicyError) as caught:
         Policy.load(path)
     assert message in str(caught.value)

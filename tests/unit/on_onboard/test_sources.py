@@ -37,7 +37,7 @@ def observations(name, seed):
     return np.array(shown), pilot.layout, valid[0]
 
 
-def changed(name):
+def find_changes(name):
     """Columns that differ between two throws of other keypoints, goals and payloads."""
     (one, layout, _), (two, _, _) = observations(name, 1), observations(name, 2)
     return set(np.flatnonzero((one != two).any(axis=0))), layout
@@ -45,14 +45,14 @@ def changed(name):
 
 @mark.parametrize("name", ["vision", "vision_betaflight"])
 def test_nothing_but_keypoints_tells_of_goal_and_payload(name):
-    columns, layout = changed(name)
+    columns, layout = find_changes(name)
     assert columns == set(layout.columns(*GROUPS))
     assert not layout.fits
 
 
 def test_what_an_estimator_adds_is_found():
     """The check is not vacuous: of a located layout more columns differ."""
-    columns, layout = changed("vision_located")
+    columns, layout = find_changes("vision_located")
     assert columns & set(layout.columns("located"))
     assert columns <= set(layout.columns(*GROUPS, "located"))
 

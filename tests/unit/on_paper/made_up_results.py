@@ -55,7 +55,7 @@ def policy(
     return Result(unit, columns(rng, target, count, spread, offset, duration), MADE)
 
 
-def shipped() -> ResultSet:
+def make_shipped_book() -> ResultSet:
     """A book with throws of the shipped policies, and with unrelated entries."""
     rng = np.random.default_rng(0)
     thrown = [

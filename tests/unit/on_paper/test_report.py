@@ -21,7 +21,7 @@ from visthrow.view.parts import Grid, Picture, Text
 
 @fixture(scope="module")
 def full():
-    return made_up.shipped()
+    return made_up.make_shipped_book()
 
 
 @fixture(scope="module")

@@ -13,7 +13,7 @@ from tests.simulators import bare_quadrotor
 from visthrow.task import load_experiment
 
 
-def plant_with(path: str, value) -> PlantParams:
+def change_plant(path: str, value) -> PlantParams:
     """The paper's plant with one field, dotted, changed."""
     return changed(paper_plant(), {path: value})
 
@@ -33,12 +33,12 @@ PLANTS = [
 @mark.parametrize(("path", "value", "message"), PLANTS)
 def test_bad_plants_are_refused(path, value, message):
     with raises(ValueError, match=message):
-        HybridSim(plant_with(path, value), 1)
+        HybridSim(change_plant(path, value), 1)
 
 
 PLANT = paper_plant()
-EXCHANGED = plant_with("sim.solver", "exchanged_chain")
-AERO_LESS = [PLANT.vehicle, plant_with("vehicle.aero.kind", "none").vehicle]
+EXCHANGED = change_plant("sim.solver", "exchanged_chain")
+AERO_LESS = [PLANT.vehicle, change_plant("vehicle.aero.kind", "none").vehicle]
 SHORT = replace(PLANT.rope, segments=3)
 THREE = np.zeros((3, 3))
 REFUSED = {
@@ -125,7 +125,7 @@ def test_every_optional_number_reaches_the_kernel():
     in_every_kernel = {"wind_w", "kick_w", "kick_along"}
     refused = {"payload_sides", "cables_apart", "gripper_mass"}
     assert optional == of_extensions | in_every_kernel | refused
-    plant = plant_with("rope.gripper_mass", 0.01)
+    plant = change_plant("rope.gripper_mass", 0.01)
     with raises(ValueError, match="gripper_mass"):
         HybridSim(plant, 1)
 

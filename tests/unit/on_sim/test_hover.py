@@ -71,7 +71,7 @@ def fly(plant: LaggingPendulum, duration: float, yaw: float = 0.0, heavier=1.0, 
     return (PERIOD * np.arange(1, len(rows) + 1), *map(np.array, zip(*rows)))
 
 
-def settled(times, distances, within):
+def find_settling_time(times, distances, within):
     """Return the time after which the distance (T,) stays within a bound."""
     outside = np.flatnonzero(distances > within)
     return times[outside[-1]] if len(outside) else 0.0
@@ -83,8 +83,8 @@ def test_settles_from_half_a_metre_with_the_payload():
     )
     times, distances, swings, _ = fly(LaggingPendulum(starts), 6.0)
     for one in distances.T:
-        assert settled(times, one, 0.10) < 1.6
-        assert settled(times, one, 0.03) < 3.5
+        assert find_settling_time(times, one, 0.10) < 1.6
+        assert find_settling_time(times, one, 0.03) < 3.5
     assert distances[-1].max() < 0.01
     assert swings.max() < 0.6, "the payload must not swing up on the way"
     assert swings[-50:].max() < 0.01
@@ -106,7 +106,7 @@ def test_swing_is_damped_never_amplified(delay):
 def test_hover_without_the_payload_and_yaw_turns():
     plant = LaggingPendulum(GOAL + [[0.4, -0.3, 0.0]], payload=NOTHING)
     times, distances, _, _ = fly(plant, 6.0, yaw=2.0)
-    assert settled(times, distances[:, 0], 0.03) < 3.5
+    assert find_settling_time(times, distances[:, 0], 0.03) < 3.5
     rot_wb = matrix_of_quat(plant.measured[1])[0]
     assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == approx(2.0, abs=0.02)
 

@@ -8,7 +8,7 @@ import numpy as np
 from pytest import approx, raises
 
 from hil.control.recording.run_report import finish
-from tests.hil_runs import record_run, saved_policy
+from tests.hil_runs import record_run, save_policy
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 from visthrow.task.measurement import Throws
@@ -79,7 +79,7 @@ def test_a_goal_to_the_side_of_another_hover_point():
 
 def test_the_command(tmp_path, printed):
     folder = tmp_path / "flown"
-    record_run(folder, saved_policy(tmp_path), seconds=6.0)
+    record_run(folder, save_policy(tmp_path), seconds=6.0)
     finish(folder)
     other = tmp_path / "other"
     other.mkdir()
