@@ -569,6 +569,15 @@ def _one_size(a: Sequence, b: Sequence) -> bool:
     return apart <= float(np.linalg.norm(half_widths))
 
 
+def read_rows(path: Path) -> list[dict]:
+    """Return the rows of a file of ``--json``; bounds that JSON lacks are NaN, as they were."""
+    rows = json.loads(path.read_text())["rows"]
+    for row in rows:
+        gains = row.get("gain", {})
+        row["gain"] = {c: [np.nan if x is None else x for x in g] for c, g in gains.items()}
+    return rows
+
+
 def table(rows: Sequence[dict]) -> str:
     """Print the results."""
     lines = []
@@ -620,7 +629,7 @@ def main() -> None:
     parser.add_argument("--show", help="print the tables of such a file, and run nothing")
     args = parser.parse_args()
     if args.show:
-        return print(table(json.loads(Path(args.show).read_text())["rows"]))
+        return print(table(read_rows(Path(args.show))))
     cases = [case for case in (*SETS, *TRAPS, *PARTS) if args.only in case.name]
     rows: list[dict] = []
     for _, row in workers.done(_run_index, [(case.name, args.data) for case in cases], args.jobs):

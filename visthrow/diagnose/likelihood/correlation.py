@@ -203,8 +203,9 @@ def _likeliest(
 
     bounds = [(0.0, np.log(2.0 * LONGEST / period)), logit(SHARES)]
     order = min((1, 2), key=lambda order: shortfall(START[0], order))
-    options = {"initial_simplex": START, "xatol": np.inf, "fatol": noise.ENOUGH_NATS}
-    minimize(shortfall, START[0], (order,), "Nelder-Mead", bounds=bounds, options=options)
+    simplex = np.clip(START, *np.transpose(bounds))
+    options = {"initial_simplex": simplex, "xatol": np.inf, "fatol": noise.ENOUGH_NATS}
+    minimize(shortfall, simplex[0], (order,), "Nelder-Mead", bounds=bounds, options=options)
     best = max(value for value, _ in tried)
     near = [guess for value, guess in tried if value > best - STRONG and guess.time <= LONGEST]
     if not near:

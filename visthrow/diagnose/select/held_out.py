@@ -200,9 +200,9 @@ def channel_gains(
     names = work.problem.model.channels
     row = np.unique(groups, return_inverse=True)[1]
     floors = work.problem.priors.floor
-    shifts = [w.effects @ size for w, size in zip(after.windows, trained[row] * floors)]
-    model = [w.residual + w.effects @ (after.theta * floors) for w in after.windows]
-    named = [residual - shift for residual, shift in zip(model, shifts)]
+    change = (after.theta - trained)[row] * floors
+    named = [w.residual + w.effects @ shift for w, shift in zip(after.windows, change)]
+    shifts = [w.effects @ (after.theta * floors) for w in after.windows]
     plain = [w.residual for w in before.windows]
     left = errors(after.windows, groups, after.noise, named, len(names))
     promised = errors(after.windows, groups, after.noise, shifts, len(names)).square
@@ -213,47 +213,64 @@ def channel_gains(
     squares = np.stack((earlier, left.square, left.floor, box, promised))
     gains = []
     for c, name in enumerate(names):
-        count = left.count[:, c].sum(0)
+        count = left.count[:, c]
         if count.sum() > 0:
             gains.append(_channel(name, after.sigma(c), count, squares[:, :, c]))
     return tuple(gains)
 
 
 def _channel(name: str, sigma: float, count: ndarray, squares: ndarray) -> ChannelGain:
-    """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums
-    before, after, of noise alone, of the black box and of what the sizes change, by flight and
-    horizon, shape (5, F, H).
+    """Return the gain of a channel; ``count``: samples by flight and horizon, shape (F, H);
+    ``squares``: sums before, after, of noise alone, of the black box and of what the sizes change,
+    by flight and horizon, shape (5, F, H).
     """
     by_flight = squares.sum(2)
+    samples = count.sum(0)
     by_horizon = np.maximum(squares.sum(1), 0.0)
     totals = np.maximum(by_flight.sum(1), 0.0)
-    before, after, floor, box, _ = (sigma * np.sqrt(totals / count.sum())).tolist()
-    value, low, high = gain_of(by_flight[0], by_flight[1], by_flight[4])
-    measured = count > 0
-    curves = np.sqrt(by_horizon[:3, measured] / count[measured])
+    before, after, floor, box, _ = (sigma * np.sqrt(totals / samples.sum())).tolist()
+    value, low, high = gain_of(by_flight[0], by_flight[1], by_flight[4], count.sum(1))
+    measured = samples > 0
+    curves = np.sqrt(by_horizon[:3, measured] / samples[measured])
     rows = np.vstack((np.array(HORIZONS)[measured], curves)).T.tolist()
     errors_of = before, after, min(floor, after), box
     return ChannelGain(name, unit_of(name), *errors_of, value, low, high, tuple(map(tuple, rows)))
 
 
-def gain_of(before: ndarray, after: ndarray, promised: ndarray) -> tuple[float, float, float]:
+def gain_of(
+    before: ndarray, after: ndarray, promised: ndarray, count: ndarray
+) -> tuple[float, float, float]:
     """Return the gain 1 - sqrt(sum after / sum before) with a 95 % interval.
 
-    Flights excite a cause unequally, and noise is left in each. So what counts is how far the fall
-    of a flight's squares is from the part of what the sizes promise there that all flights bring.
+    Flights excite a cause unequally, and errors of another origin are left in each. So a flight's
+    fall is compared with what the sizes promise there, and what is left with its number of samples.
+    The interval is that of the flights' scatter about both (Student, over those that can tell), or
+    of noise alone where it is wider.
 
     Args:
         before: sums of squares by flight, in sigmas, shape (F,).
         after: those that held-out sizes leave, shape (F,).
-        promised: squares of what these sizes change, shape (F,).
+        promised: squares of what the sizes change, shape (F,).
+        count: number of samples, shape (F,).
+
+    Source: the delta method for log(after / before), e.g. Efron and Tibshirani 1993, ch. 21.
     """
-    total = before.sum()
-    if total <= 0.0:
+    old = before.sum()
+    left = after.sum()
+    total = promised.sum()
+    if old <= 0.0 or left <= 0.0:
         return 0.0, np.nan, np.nan
     fall = before - after
-    _, low, high = share_of(0.5 * promised, 0.5 * fall)
-    remaining = 1.0 - np.array([fall.sum(), low * promised.sum(), high * promised.sum()]) / total
-    return tuple((1.0 - np.sqrt(np.maximum(remaining, 0.0))).tolist())
+    n = count_telling(0.5 * promised)
+    reach = np.nan
+    if n > 1 and total > 0.0:
+        rest = after - left * count / count.sum()
+        differing = fall - fall.sum() * promised / total
+        influence = (fall.sum() / left * rest - differing) / old
+        scatter = stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1.0) * (influence**2).sum())
+        reach = max(scatter, NORMAL_95 * np.sqrt(4.0 * total) / old)
+    value = np.log(left / old)
+    return tuple((1.0 - np.exp(0.5 * (value + np.array([0.0, reach, -reach])))).tolist())
 
 
 def measure(diagnosis: Diagnosis) -> HeldOut:
