@@ -253,7 +253,7 @@ def gain_of(
         promised: squares of what the sizes change, shape (F,).
         count: number of samples, shape (F,).
 
-    Source: the delta method for log(after / before), e.g. Efron and Tibshirani 1993, ch. 21.
+    Source: the delta method for log(after / before), van der Vaart 1998, ch. 3.
     """
     old = before.sum()
     left = after.sum()
