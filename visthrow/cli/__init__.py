@@ -107,8 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _find_hiding_file(error: ModuleNotFoundError) -> str | None:
-    """File of a foreign module or package that stands where one of ours is looked for, as a
-    ``camera.py`` in the working folder.
+    """Return the file of another module that hides one of this project, such as a ``camera.py`` in
+    the working folder; None without one.
     """
     name = (error.name or "").partition(".")[0]
     module = sys.modules.get(name)

@@ -204,7 +204,7 @@ def throw_hybrid(
 
 
 def label_throws(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
-    """Return throws on a plant with what they are called; ``notes`` end the title."""
+    """Return throws on a plant under a title; ``notes`` are appended to it."""
     from visthrow.throws.plants import PLANTS
 
     short, long = PLANTS[plant]

@@ -28,7 +28,7 @@ EXIT_INTERRUPTED = 130
 def make_number_parser(
     kind: type, good: Callable[[float], bool], expected: str
 ) -> Callable[[str], float]:
-    """Return what reads a number of the command line that must be good."""
+    """Return a parser of command-line numbers that refuses those which are not good."""
 
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):

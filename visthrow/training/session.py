@@ -170,7 +170,7 @@ class Regularly:
 
     @contextlib.contextmanager
     def measure_cost(self) -> Iterator[None]:
-        """Measure what one costs."""
+        """Measure how long the block takes, and plan the next one by it."""
         begin = time.perf_counter()
         yield
         end = time.perf_counter()

@@ -41,8 +41,8 @@ def lock_of(out: Path, name: str) -> Path:
 def hold_lock(path: Path) -> Iterator[None]:
     """Hold the lock on a file, which says who has it; BusyError where another process does.
 
-    The kernel lets go of it with the process. The file stays: removing it would let two processes
-    lock two files of one name."""
+    The kernel releases the lock when the process ends. The file stays: if it were removed, two
+    processes could lock two files of one name."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+", encoding="utf-8") as file:
         try:
