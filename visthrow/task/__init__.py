@@ -391,12 +391,9 @@ class Experiment:
                 f" {self.rope.payload_radius} m"
             )
             raise ConfigError(f"{message}; expected the same ball")
-        for wrong in (
-            ()
-            if self.fleet is not None
-            else (*_find_wrong_units(self), *_find_impossible_vehicle(self))
-        ):
-            raise ConfigError(wrong)
+        if self.fleet is None:
+            for wrong in (*_find_wrong_units(self), *_find_impossible_vehicle(self)):
+                raise ConfigError(wrong)
 
 
 def _largest_rates(vehicle: VehicleParams) -> Vector:

@@ -258,7 +258,7 @@ def terms_of(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
 
 def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
     """Return what all terms of :func:`terms_of` exert at the knots with a coefficient of 1, shape
-    (k, 3, T); products of scalars and vectors are computed once each.
+    (k, 3, T). Each product of scalars, and each vector, is computed once.
     """
     vectors = VECTORS[terms[0].block]
     names = dict.fromkeys(term.vector for term in terms)

@@ -266,9 +266,12 @@ def gain_of(
     if n > 1 and total > 0.0:
         rest = after - left * count / count.sum()
         differing = fall - fall.sum() * promised / total
+        # of each flight on log(after / before)
         influence = (fall.sum() / left * rest - differing) / old
         scatter = stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1.0) * (influence**2).sum())
-        reach = max(scatter, NORMAL_95 * np.sqrt(4.0 * total) / old)
+        # noise scatters a fall with 4 times its promise as variance
+        chance = NORMAL_95 * np.sqrt(4.0 * total) / old
+        reach = max(scatter, chance)
     value = np.log(left / old)
     return tuple((1.0 - np.exp(0.5 * (value + np.array([0.0, reach, -reach])))).tolist())
 
