@@ -1,17 +1,16 @@
-"""Measurement noise that is correlated: what filters and a tracker's own dynamics leave between
-neighbouring samples.
+"""Correlated measurement noise, as filters and trackers leave it.
 
-The noise of a channel's component is white for a part, and for a share w it follows a filter of
-first or second order (Matern 1/2 and 3/2):
+A share w of the variance is the output of a filter of first or second order (Matern 1/2 and 3/2);
+the rest is white:
 
     c(t) = (1 - w) [t = 0] + w k(t / tau),   k_1(x) = exp(-x),   k_2(x) = (1 + x) exp(-x)
 
-Every window gets the Cholesky factors of these correlations at its stamps. The inner products of
-:mod:`visthrow.diagnose.likelihood.marginal` are those of whitened columns, so evidence, thresholds
-and intervals account for the correlations. Neighbouring samples say nothing about the noise at low
-frequencies, where causes lie. So time, share and order are chosen by the likelihood of whole
-windows, with initial states, latent forces and every effect integrated out: no cause passes for
-noise.
+Every window gets the Cholesky factors of these correlations at its stamps, with which
+:mod:`visthrow.diagnose.likelihood.marginal` whitens its columns. So evidence, thresholds and
+intervals account for the correlations. Differences of neighbouring samples would not show the noise
+at low frequencies, at which effects act. So time, share and order maximise the likelihood of whole
+windows, with initial states, latent forces and every effect integrated out: no effect is mistaken
+for noise.
 
 Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal likelihood).
 """
@@ -35,26 +34,26 @@ from visthrow.diagnose.models.model_interface import Window
 T = TypeVar("T")
 
 SUSPECT = 0.1
-"""Correlation of neighbouring samples above which a channel is examined. Of ten thousand white
-samples it has a deviation of 0.01.
+"""Correlation of neighbouring samples above which a channel is examined. For ten thousand white
+samples its standard deviation is 0.01.
 """
 
 LONGEST = 0.15
-"""Longest correlation time [s]. A residual that lasts longer is not a sensor's noise: the model
-lacks something.
+"""Longest correlation time [s]. A residual that lasts longer is a modelling error, not sensor
+noise.
 """
 
 SHARES = 0.5, 0.999
-"""Limits of the correlated share of the variance. The white rest keeps the inverse of the
+"""Limits of the correlated share of the variance. The white remainder keeps the inverse of the
 correlations finite in double precision.
 """
 
 START = np.array([[1.4, 3.0], [2.5, 3.0], [1.4, 5.0]])
-"""Simplex at which the search begins: logarithm of the time in sampling periods, and of the
-share's odds.
+"""Initial simplex of the search: logarithms of the time in sampling periods and of the share's
+odds.
 """
 
-# windows that the estimate uses; also a sample of windows, before all of them are examined
+# windows that the estimate uses; also the size of a sample that is tried before all windows are
 LOOKED_AT = 8
 
 
@@ -65,10 +64,10 @@ class Correlation:
     time: float  # [s]
     share: float  # of the variance
     order: int  # of the filter: 1 or 2
-    scale: float = 1.0  # of the deviation that is stated
+    scale: float = 1.0  # factor on the stated sigma
 
     def at_lag(self, lag: ndarray) -> ndarray:
-        """Correlation of samples ``lag`` [s] apart."""
+        """Return the correlation of samples ``lag`` [s] apart."""
         x = np.abs(lag) / self.time
         kernel = np.exp(-x)
         if self.order == 2:
@@ -78,8 +77,8 @@ class Correlation:
 
 
 def components(window: Window, channel: int) -> ndarray | None:
-    """Rows of a channel's samples, shape (stamps, components), in the order of time; None where
-    stamps differ by component.
+    """Return the rows of a channel's samples in the order of time, shape (stamps, components); None
+    where the components have different stamps.
     """
     rows = np.flatnonzero(window.channel == channel)
     time = window.time[rows]
@@ -93,9 +92,9 @@ def components(window: Window, channel: int) -> ndarray | None:
 def with_correlations(
     windows: Sequence[Window], correlations_of: Mapping[int, Correlation]
 ) -> list[Window]:
-    """Give windows the correlations of their channels' noise.
+    """Add the correlations of the channels' noise to windows.
 
-    ``windows``: with white noise; ``correlations_of``: of channels, by number."""
+    ``windows``: with white noise; ``correlations_of``: by index of the channel."""
     if not correlations_of:
         return list(windows)
     return parallel_map(partial(_add_correlation, correlations_of=correlations_of), windows)
@@ -118,10 +117,10 @@ def _add_correlation(window: Window, correlations_of: Mapping[int, Correlation])
 def correlations(
     windows: Sequence[Window], slabs: ndarray, channels: int
 ) -> dict[int, Correlation]:
-    """Estimate which channels' noise is correlated, and how.
+    """Find the channels whose noise is correlated, and estimate the correlation.
 
     ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the
-    model's channels. Returns channel -> its noise, where that is surely not white."""
+    model's channels. Returns channel -> correlation, for noise that is surely not white."""
     free = [_free_effects(window, slabs) for window in few_of(windows)]
     bare = parallel_map(partial(hidden_gram, channels=channels), free)
     fits = noise.widely_fitted(free, bare)
@@ -138,13 +137,15 @@ def correlations(
 
 
 def few_of(items: Sequence[T]) -> list[T]:
-    """Some of them, spread evenly."""
+    """Return :data:`LOOKED_AT` of the items, spread evenly."""
     places = np.linspace(0, len(items) - 1, LOOKED_AT).astype(int)
     return [items[i] for i in np.unique(places)]
 
 
 def _free_effects(window: Window, slabs: ndarray) -> Window:
-    """A window in which every effect may have a size of its own."""
+    """Return the window with its effects as nuisances, so that each is fitted in this window
+    alone.
+    """
     states = np.hstack((window.nuisance, window.effects))
     deviations = np.append(window.nuisance_sd, slabs)
     none = window.effects[:, :0]
@@ -154,8 +155,8 @@ def _free_effects(window: Window, slabs: ndarray) -> Window:
 def _suspect_deviation(
     windows: Sequence[Window], residuals: Sequence[ndarray], channel: int
 ) -> float | None:
-    """Return the deviation of a channel's residual as a multiple of the stated one; None where
-    neighbouring samples are hardly correlated.
+    """Return the standard deviation of a channel's residual in multiples of the stated one; None
+    where neighbouring samples are hardly correlated.
     """
     parts = []
     for window, residual in zip(windows, residuals):
@@ -169,7 +170,7 @@ def _suspect_deviation(
     parts = [np.clip(part, -distant, distant) for part in parts]
     square = sum((part**2).sum() for part in parts)
     neighbours = sum((part[1:] * part[:-1]).sum() for part in parts)
-    if neighbours <= SUSPECT * square:  # also where nothing is left
+    if neighbours <= SUSPECT * square:  # also where both are 0
         return None
     return np.sqrt(square / len(together))
 
@@ -181,10 +182,11 @@ def _likeliest(
     channel: int,
     scale: float,
 ) -> tuple[Correlation, float]:
-    """Return the correlation of a channel beside those known, and its nats above white noise.
+    """Return the likeliest correlation of a channel, given those of other channels, and by how many
+    nats it is ahead of white noise.
 
     Time and share trade off along a ridge. Of the guesses that are nearly as likely as the best,
-    it is the one with the shortest time."""
+    the one with the shortest time is returned."""
     steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
     period = np.median(np.concatenate(steps))
     white = [Correlation(period, 0.0, 1, deviation) for deviation in (1.0, scale)]
@@ -221,8 +223,8 @@ def _likelihood(
     guess: Correlation,
     start: noise.Noise | None = None,
 ) -> tuple[float, noise.Noise]:
-    """Return the log marginal likelihood of windows with a guess of a channel's correlation, and
-    their noise levels; ``start``: where the search for these begins.
+    """Return the log marginal likelihood of windows for a guess of a channel's correlation, and the
+    likeliest noise levels; ``start``: where the search for the levels begins.
     """
     correlated = with_correlations(windows, {**correlations_of, channel: guess})
     grams = parallel_map(partial(hidden_gram, channels=channels), correlated)

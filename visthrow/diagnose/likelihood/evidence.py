@@ -1,20 +1,21 @@
-"""Evidence for sets of effects, with floors: whatever is not named may still be there below its
-floor.
+"""Marginal likelihood of sets of effects, under a spike-and-slab prior.
 
-In floors, an effect that is not named has the prior N(0, SPIKE^2), so that a floor is two
-deviations; a named one has N(0, prior^2) within its bounds (the slab):
+Sizes are in floors: an effect's floor is its negligible size. An effect that is not selected may
+still be present below its floor: its prior is the spike N(0, SPIKE^2), whose two standard
+deviations are the floor. The prior of a selected effect is the slab N(0, prior^2) within its
+bounds:
 
     log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and
     posterior's mass within the bounds
 
 with information I and scores s about theta = 0.
 
-Eight constants take part in what is named and what is said of it; all stand here. Whatever else a
-decision is compared with follows from them, from the catalogue's floors and from the 5 mm of
-landing behind these. 34 worlds were judged alike with ``MODEL_ERROR_FLOOR`` at half and double,
-``INEXACT`` at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and 4, ``LOST_SHARE`` at 0.1 and 0.25, one at
-a time (``bench.diagnose.constants``). Other modules' constants say how far a search or a sum goes
-on."""
+Eight constants decide which effects are selected and which verdict each gets. All of them are in
+this module. Every other limit of a decision is derived from them and from the catalogue's floors,
+which in turn stand for 5 mm of landing error. 34 hidden worlds got the same verdicts with
+``MODEL_ERROR_FLOOR`` at half and double, ``INEXACT`` at 0.2 and 0.45, ``UNKNOWN_RATIO`` at 2.5 and
+4, ``LOST_SHARE`` at 0.1 and 0.25, changed one at a time (``bench.diagnose.constants``). Constants
+in other modules only limit the effort of a search or a sum."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,55 +32,59 @@ from visthrow.diagnose.models.model_interface import Effect
 
 POSSIBLE = 1.0 / 20.0
 ALARM = 1.0 / 150.0
-"""Odds below which a set is no longer possible, and share of worlds with nothing wrong in which
-something is named.
+"""Odds below which a set of effects is no longer possible; share of worlds without any error in
+which an effect may be selected by chance.
 
 Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995, section 3.2)."""
 
 NORMAL_95 = float(ndtri(1.0 - 0.5 * POSSIBLE))  # deviations to either end of an interval
 STRONG = -float(np.log(POSSIBLE))
 VERY_STRONG = -float(np.log(ALARM))
-"""Nats: what is less than strongly behind counts as possible; any cause must be very strong,
-however few are in question. Where nothing is wrong, a Bayes factor exceeds 1 / ALARM in no more
-than ALARM of worlds (Markov's inequality).
+"""Evidence [nats]. A set less than ``STRONG`` behind the best one counts as possible. An effect
+needs at least ``VERY_STRONG``, however few are compared: where nothing is wrong, a Bayes factor
+exceeds 1 / ALARM in at most a share ALARM of worlds (Markov's inequality).
 """
 
 SPIKE = 0.5
-"""Deviation of an effect that is not named, in its floor: the floor is the limit of what may go
-unnamed, two deviations from none, not its usual size.
+"""Prior standard deviation of an effect that is not selected, in floors: the floor is an upper
+limit, two deviations from 0, not a typical size.
 """
 
 MODEL_ERROR_FLOOR = 0.1
-"""Deviation that numerics and what an effect's form leaves out add to its estimate, in its floor.
+"""Standard deviation of an estimate that numerical error and an effect's simplified form add, in
+floors.
 
-With it 95 % intervals held 94 % of 85 sizes that were hidden in plants of other code than the
-simulator's.
+With it, the 95 % intervals held 94 % of 85 sizes that were hidden in plants with code other than
+the simulator's.
 """
 
 INEXACT = 0.3
-"""Part by which the form of anything may be off: of an effect from flight to flight, of another
-kind of block, of a force against the thrust, of the misfit of a window that begins in a motion that
-nobody knows, of a size that derivatives of elsewhere give, of an effect that another of its group
-would replace.
+"""Relative error of any model form. It applies to an effect that differs between flights, to
+another kind of block, to a force compared with the thrust, to the residual of a window whose
+initial motion is unknown, to a size predicted by derivatives taken elsewhere, and to an effect that
+another of its group could replace.
 """
 
 UNKNOWN_RATIO = 3.0
-"""What is so many times the noise, or the quietest phase's gusts, is neither.
+"""Ratio to the noise, or to the gusts in the quietest phase, above which a force is neither of
+them.
 
-Of 18 worlds that names explained and 6 with nothing to explain, no phase was above 2.8 times.
+In 18 worlds explained by effects and 6 without any error, no phase exceeded a ratio of 2.8.
 """
 
 LOST_SHARE = 0.15
-"""Share of windows that the simulation may lose; where more are so far off, something is missing.
+"""Share of windows that the simulation may fail to follow; if it fails in more, an effect is
+missing.
 
-Chosen below the share that one phase has, so that a force that acts in that alone is kept.
+It is below the share of windows that one phase has, so that a force acting in that phase alone is
+not dismissed.
 """
 
 FEWEST = 3
-"""Flights, or parts of flights, that can disagree: of two that differ, neither is the odd one."""
+"""Smallest number of flights, or parts of flights, in which an outlier can be identified."""
 
 Sets = Sequence[tuple[tuple[int, ...], float]]
-"""Numbers of the effects of each possible set, and its nats behind the best."""
+"""Indices of the effects in each possible set, and how many nats it is behind the best one."""
 
 CALIBRATION_DRAWS = 4000
 
@@ -89,15 +94,15 @@ class Priors:
     """Prior beliefs about each effect, in floors; arrays of shape (K,)."""
 
     floor: ndarray  # in the effects' units
-    slab: ndarray  # deviation of a named effect
-    # of a named effect; another kind of block is there as a whole, but for its form
+    slab: ndarray  # standard deviation of a selected effect
+    # bounds of a selected effect; another kind of block is either absent or nearly whole
     low: ndarray
     high: ndarray
-    visible: ndarray  # bool: all its channels are there
+    visible: ndarray  # bool: whether all channels that show the effect were logged
 
     @staticmethod
     def of(effects: Sequence[Effect], channels: Sequence[str]) -> "Priors":
-        """Read them off the catalogue.
+        """Take the priors from the catalogue.
 
         Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0.
         """
@@ -124,18 +129,18 @@ class Priors:
 
     @cached_property
     def log_within(self) -> ndarray:
-        """Return the log of each named effect's prior mass within its bounds, shape (K,)."""
+        """Return the log prior mass of each effect within its bounds, if selected, shape (K,)."""
         return _log_mass(np.zeros_like(self.slab), self.slab, self.low, self.high)
 
     def deviation(self, active: Sequence[int]) -> ndarray:
-        """Prior deviations with these effects named, shape (K,)."""
+        """Return the prior standard deviations if these effects are selected, shape (K,)."""
         spread = np.full(len(self.floor), SPIKE)
         spread[list(active)] = self.slab[list(active)]
         return spread
 
 
 def _log_mass(mean: ndarray, sd: ndarray, low: ndarray, high: ndarray) -> ndarray:
-    """Logarithm of a normal distribution's mass within bounds, accurate far in the tails."""
+    """Return the log mass of a normal distribution within bounds, accurate far in the tails."""
     a = (low - mean) / sd
     b = (high - mean) / sd
     flip = a > 0.0  # use the tail that does not round to 1
@@ -147,7 +152,7 @@ def _log_mass(mean: ndarray, sd: ndarray, low: ndarray, high: ndarray) -> ndarra
 
 @dataclass(frozen=True)
 class Posterior:
-    """The statistics of flights, with what was believed of the effects before."""
+    """The statistics of all flights together, combined with the priors of the effects."""
 
     information: ndarray  # I, shape (K, K)
     score: ndarray  # s about theta = 0, shape (K,), or (n, K) for n draws at once
@@ -155,14 +160,14 @@ class Posterior:
 
     @staticmethod
     def of(statistics: Statistics, priors: Priors) -> "Posterior":
-        """Return what all flights say together."""
+        """Add up the statistics of all flights."""
         information = statistics.information.sum(0)
         return Posterior(information, statistics.absolute.score.sum(0), priors)
 
     def _factor(self, deviation: ndarray) -> ndarray:
-        """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.
+        """Return the lower Cholesky factor of 1 + D^1/2 I D^1/2; its upper triangle is arbitrary.
 
-        Raises DiagnoseError: not positive definite, not finite.
+        Raises DiagnoseError: the matrix is not positive definite or not finite.
         """
         scaled = self.information * np.outer(deviation, deviation)
         scaled.flat[:: len(scaled) + 1] += 1.0
@@ -176,20 +181,22 @@ class Posterior:
         return factor
 
     def covariance(self, active: Sequence[int]) -> ndarray:
-        """Posterior covariance (I + D^-1)^-1 with these effects named, shape (K, K)."""
+        """Return the posterior covariance (I + D^-1)^-1 with these effects selected, shape (K,
+        K).
+        """
         deviation = self.priors.deviation(active)
         factor = self._factor(deviation)
         inverse = lapack.dpotrs(factor, np.eye(len(deviation)), lower=1)[0]
         return inverse * np.outer(deviation, deviation)
 
     def mean(self, active: Sequence[int]) -> ndarray:
-        """Return the most probable size of every effect, those not named below their floors; shape
+        """Return the posterior mean of every effect's size with these effects selected, shape
         (K,).
         """
         return self.covariance(active) @ self.score
 
     def log_evidence(self, active: Sequence[int]) -> float:
-        """log Z of one set of named effects."""
+        """Return log Z of one set of selected effects [nats]."""
         columns = list(active)
         deviation = self.priors.deviation(columns)
         factor = self._factor(deviation)
@@ -204,24 +211,26 @@ class Posterior:
         return float(value)
 
     def _log_within(self, sets: Sequence[int] | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
-        """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
+        """Return the log of the posterior mass within the effects' bounds, minus that of the
+        prior.
+        """
         priors = self.priors
         return _log_mass(mean, sd, priors.low[sets], priors.high[sets]) - priors.log_within[sets]
 
     def additions(self, active: Sequence[int]) -> ndarray:
-        """Gain of log Z by naming one more effect, for each effect; -inf for those named already or
-        not visible.
+        """Return the gain of log Z if one more effect is selected, for each effect.
 
-        A change of one prior is a rank-one update, so all candidates and all draws cost one
-        factorisation. Returns nats, of the score's shape."""
+        A change of one prior is a rank-one update, so all effects and all draws together cost one
+        factorisation. Returns nats, of the score's shape; -inf for effects that are already
+        selected or not visible."""
         return self._naming(active, np.arange(len(self.priors.floor))[:, None])
 
     def pair_additions(self, active: Sequence[int]) -> ndarray:
-        """Return the gain of log Z by naming each pair of effects: two that cancel show no gain
-        alone.
+        """Return the gain of log Z if a pair of effects is selected, for each pair.
 
-        Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on
-        the diagonal."""
+        Two effects that cancel each other show no gain alone. Returns nats, shape (K, K),
+        symmetric; -inf for effects that are already selected or not visible, and on the
+        diagonal."""
         size = len(self.score)
         rows, columns = np.triu_indices(size, 1)
         gain = np.full((size, size), -np.inf)
@@ -229,8 +238,8 @@ class Posterior:
         return np.maximum(gain, gain.T)
 
     def _naming(self, active: Sequence[int], sets: ndarray) -> ndarray:
-        """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their
-        numbers, shape (P, m).
+        """Return the gain of log Z if m more effects are selected, for P sets of them; ``sets``:
+        their indices, shape (P, m).
         """
         priors = self.priors
         sigma = self.covariance(active)
@@ -241,8 +250,8 @@ class Posterior:
         taken = np.linalg.inv(variance + unit / change[:, None])
         weighed = taken @ mean[..., None]
         wide_mean = mean - (variance @ weighed)[..., 0]
-        # A name widens its prior and so the posterior. What comes out narrower is a set with a name
-        # that is there already; it is left out below.
+        # Selecting an effect widens its prior and so its posterior. Only a set with an effect that
+        # is already selected comes out narrower; its gain becomes -inf below.
         wide = np.maximum(variance - variance @ taken @ variance, variance)
         wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
         explained = (mean * weighed[..., 0]).sum(-1)
@@ -254,8 +263,8 @@ class Posterior:
         return np.where(out[sets].any(1), -np.inf, gain)
 
     def estimate(self, active: Sequence[int]) -> ndarray:
-        """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
-        shape (K,).
+        """Return the most probable sizes of the selected effects within their bounds, 0 for all
+        others; in floors, shape (K,).
         """
         from scipy.optimize import lsq_linear
 
@@ -268,12 +277,12 @@ class Posterior:
             right = np.linalg.solve(factor, self.score[columns])
             bounds = priors.low[columns], priors.high[columns]
             solution = lsq_linear(factor.T, right, bounds, method="bvls").x
-            theta[columns] = np.clip(solution, *bounds)  # which the solver leaves by rounding
+            theta[columns] = np.clip(solution, *bounds)  # the solver exceeds bounds by rounding
         return theta
 
     def averaged(self, j: int, sets: Sets) -> tuple[float, float]:
-        """Return mean and deviation of an effect over the possible sets that hold it, all other
-        effects free below their floors, in floors.
+        """Return mean and standard deviation of an effect's size, averaged over the possible sets
+        that contain it, in floors. Effects outside a set keep their spike priors.
         """
         estimates = []
         for members, distance in sets:
@@ -285,8 +294,8 @@ class Posterior:
         return float(mean), float(np.sqrt(variance))
 
     def mean_sizes(self, active: Sequence[int], sets: Sets) -> ndarray:
-        """Return the means of some effects as :meth:`averaged`, within their bounds, and 0 for all
-        others; in floors, shape (K,).
+        """Return the means of the selected effects by :meth:`averaged`, clipped to their bounds,
+        and 0 for all others; in floors, shape (K,).
         """
         theta = np.zeros(len(self.score))
         for j in active:
@@ -296,18 +305,18 @@ class Posterior:
         return theta
 
     def certainty(self, theta: ndarray, active: Sequence[int]) -> ndarray:
-        """Sizes of named effects in the half widths of 95 % intervals to which half a floor is
-        added, in the order of ``active``.
+        """Return the sizes of selected effects divided by the half widths of their 95 % intervals,
+        which are widened by half a floor; in the order of ``active``.
 
-        Above 1 it is more than what may go unnamed.
+        Above 1, an effect is surely not 0 and not negligible.
         """
         columns = list(active)
         variance = np.diag(self.covariance(columns))[columns]
         return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(variance), SPIKE))
 
     def certainly_nonzero(self, active: Sequence[int]) -> list[int]:
-        """Return the named effects that are surely not 0 beside one another; the least certain is
-        left out first.
+        """Drop the least certain of the selected effects until all others are surely not 0; return
+        those.
         """
         remaining = list(active)
         while remaining:
@@ -319,8 +328,8 @@ class Posterior:
 
 
 def null_draws(information: ndarray, draws: int, rng: np.random.Generator) -> ndarray:
-    """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from
-    its spike, shape (draws, K).
+    """Draw scores of null worlds, in which every effect's size comes from its spike; shape
+    (draws, K).
     """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -330,11 +339,11 @@ def null_draws(information: ndarray, draws: int, rng: np.random.Generator) -> nd
 
 
 def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator) -> float:
-    """Return the nats that the best of all effects exceeds in a share ``ALARM`` of null worlds, at
-    least ``VERY_STRONG``.
+    """Return the evidence that an effect needs [nats]: what the best of all effects exceeds by
+    chance in a share ``ALARM`` of null worlds, and at least ``VERY_STRONG``.
 
-    The null worlds have these flights' information, noise as fitted, and of every effect what may
-    go unnamed."""
+    Null worlds have the information and the fitted noise of these flights. Each of their effects is
+    drawn from its spike."""
     information = statistics.information.sum(0)
     if not priors.visible.any():
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")

@@ -1,8 +1,8 @@
-"""Prediction errors: what is left ahead of the beginnings of windows.
+"""Prediction errors within windows, by horizon.
 
-Within a window the initial state is fitted to the first HEAD seconds; what follows is predicted and
-compared at rising horizons. A window without an initial state (means, a motor's stand, a camera's
-view) has nothing to fit, and is predicted whole."""
+The initial state is fitted to the head of a window; the rest is predicted from it and compared with
+the measurement. A window without an initial state (means, a motor on a stand, a camera's view)
+has no head: all of it is predicted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,43 +26,43 @@ HORIZONS = (
     0.45,
     0.6,
     1.0,
-)  # upper ends of the horizons [s]; what lies beyond the last belongs to it
+)  # upper ends of the horizons [s]; the last one has no end
 
 
-# times the squares that are left, from which an expectation is no floor of them
+# ratio of the expected to the actual squares above which the expectation is not used
 FAR_ABOVE = UNKNOWN_RATIO**2
 
 UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
-"""Of residuals: an attitude's are rotation vectors, and the small models have channels of their
-own.
+"""Units of residuals that differ from the channel's (an attitude's residual is a rotation vector),
+and those of channels that only the small models have.
 """
 
 
 READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s")}
-"""Unit -> factor and unit in pictures and tables, where residuals are small."""
+"""Unit -> factor and unit for pictures and tables, as residuals are small."""
 
 
 def readable(unit: str) -> tuple[float, str]:
-    """Return what a unit of residuals is multiplied by where people read it, and the unit then."""
+    """Return the factor from a unit of residuals to one that people read, and that unit."""
     return READABLE.get(unit, (1.0, unit))
 
 
 def unit_of(channel: str) -> str:
-    """Unit of a channel's residuals; empty where it has none, or none that is known."""
+    """Return the unit of a channel's residuals; empty if it has none or an unknown one."""
     standard = STANDARD_CHANNELS.get(channel)
     return UNITS.get(channel, standard.unit if standard else "")
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Sums over the samples ahead, for groups of windows (flights), channels and horizons, shape
-    (F, C, H) each.
+    """Sums over the predicted samples, for groups of windows (flights), channels and horizons,
+    shape (F, C, H) each.
     """
 
-    square: ndarray  # of what is left, in sigmas
-    count: ndarray  # of samples
-    # squares expected of sensor noise and of the initial state's uncertainty alone; of a window in
-    # which that is far more than is left, as of a state that the head hardly tells, what is left
+    square: ndarray  # squared prediction errors, in sigmas
+    count: ndarray  # number of samples
+    # squares expected from sensor noise and from the initial state's uncertainty alone. Where the
+    # head hardly determines the state, the expectation far exceeds the error; then it is the error.
     floor: ndarray
 
 
@@ -73,10 +73,10 @@ def errors(
     residuals: Sequence[ndarray],
     channels: int,
 ) -> Errors:
-    """Predict each window's end from its head and add up what is left.
+    """Predict the rest of each window from its head and add up the errors.
 
     Args:
-        groups: to which group (flight) each belongs; F of them.
+        groups: the group (flight) of each window; F groups.
         noise: for the sensor scales.
         residuals: of each window, in the channels' units, shape (N,).
         channels: number C of channels.
@@ -97,11 +97,10 @@ def errors(
 
 
 def predicted(window: Window, noise: Noise, residual: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Predict the end of a window from its head.
+    """Predict the rest of a window from its head.
 
-    Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the
-    square that noise is expected to leave there, shape (N,), and the horizon's index (-1 in the
-    head), shape (N,).
+    Returns the prediction error in sigmas, of the residual's shape, the square of it that noise
+    alone would cause, shape (N,), and the horizon's index (-1 in the head), shape (N,).
 
     Args:
         window: of N samples.
@@ -126,14 +125,14 @@ def predicted(window: Window, noise: Noise, residual: ndarray) -> tuple[ndarray,
         root = _root(window, scale)
         left = root - states @ (spread @ (weighted @ root[head]))
         expected = (left**2).sum(1) + ((states @ spread) ** 2).sum(1)
-    else:  # what that is where noise is white
+    else:  # the same for white noise
         expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
     nearest = np.minimum(np.searchsorted(HORIZONS, horizon_time), len(HORIZONS) - 1)
     return innovation, expected, np.where(head, -1, nearest)
 
 
 def _root(window: Window, scale: ndarray) -> ndarray:
-    """Square root of the covariance of a window's noise in sigmas, shape (N, N)."""
+    """Return a square root of the covariance of a window's noise in sigmas, shape (N, N)."""
     root = np.diag(scale)
     for rows, factor in window.correlated:
         for row in rows.T:

@@ -1,5 +1,5 @@
-"""Terms of laws (:mod:`visthrow.diagnose.models.law_terms`) as coefficients of latent forces,
-which are hats at the knots.
+"""Express terms of laws (:mod:`visthrow.diagnose.models.law_terms`) by latent forces, which are
+piecewise linear between knots.
 """
 
 from collections.abc import Sequence
@@ -14,16 +14,16 @@ from sim.effects.effect import Effect
 from visthrow.diagnose.models.law_terms import JOINT, KnotValues, Term, carries, loads
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
-FINE = 8  # points between two knots at which a curve is looked at
+FINE = 8  # points between two knots at which a curve is evaluated
 
 
 @lru_cache(maxsize=64)
 def between(count: int) -> ndarray:
-    """Coefficients of hats at the knots that come nearest to the smooth curve through values at the
-    knots, shape (k, k).
+    """Return the matrix from values at the knots to the coefficients of hat functions that
+    approximate the smooth curve through these values best, shape (k, k).
 
-    A hat each of the values themselves cuts the curve's corners: of a force that swings at 2 Hz an
-    eighth were lost."""
+    Linear interpolation of the values themselves cuts the curve's corners: it would lose an eighth
+    of a force that oscillates at 2 Hz."""
     if count < 3:
         return np.eye(count)
     fine = (np.arange(FINE * (count - 1)) + 0.5) / FINE
@@ -33,9 +33,9 @@ def between(count: int) -> ndarray:
 
 
 def through_latents(window: Window, quantities: KnotValues, block: str) -> ndarray:
-    """Latent-force coefficients that what a block exerts at the knots stands for.
+    """Return the matrix from a block's force or torque at the knots to latent-force coefficients.
 
-    Returns shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
+    Shape (L, 3 k); component i at knot j is column 3 j + i. Rows of other latent blocks are 0.
     """
     size = 3 * len(quantities["time"])
     if block != JOINT:
@@ -58,18 +58,18 @@ def _hats(window: Window, time: ndarray, block: str) -> ndarray:
 
 @dataclass(frozen=True)
 class TermEffect(Effect):
-    """A term as an effect of a model; its size is the coefficient."""
+    """A term of a law as an effect; its size is the term's coefficient."""
 
     term: Term | None = None
-    price: float = 0.0  # of its name, beyond the threshold [nats]
+    price: float = 0.0  # penalty beyond the threshold [nats]
 
     def __post_init__(self) -> None:
-        """Accept any bounds: a coefficient has none."""
+        """Skip the check of bounds: a coefficient has none."""
 
 
 def forces(window: Window, effects: Sequence[TermEffect]) -> ndarray:
-    """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
-    T).
+    """Return the latent-force coefficients of a window that equal each term with a coefficient of
+    1, shape (L, T).
     """
     out = np.zeros((len(window.latent_block), len(effects)))
     quantities = KnotValues(window.knots)

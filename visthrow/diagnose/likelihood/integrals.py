@@ -1,5 +1,7 @@
-"""Initial states and latent forces of windows, fitted or integrated out at some noise levels: the
-formulas of :mod:`visthrow.diagnose.likelihood.marginal`.
+"""Fit the initial states and latent forces of windows, or integrate them out, at given noise
+levels.
+
+The formulas are those of :mod:`visthrow.diagnose.likelihood.marginal`.
 """
 
 from collections.abc import Sequence
@@ -20,8 +22,7 @@ from visthrow.diagnose.likelihood.marginal import (
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
-# relative growth of the normal equations' diagonal where they are positive definite but for
-# rounding
+# relative growth of the normal equations' diagonal where rounding made them singular
 ROUNDING = 1e-10
 
 BLOCKS = len(LATENT_BLOCKS)
@@ -29,7 +30,9 @@ BLOCKS = len(LATENT_BLOCKS)
 
 @dataclass(frozen=True)
 class _Shape:
-    """A window at some noise levels, whatever its residuals are; it has n columns [X, G]."""
+    """The factorised normal equations of a window at given noise levels; n columns [X, G].
+
+    They do not depend on the residuals."""
 
     weight: ndarray  # of the channels, shape (C,)
     level: ndarray  # prior deviation of the columns, shape (n,)
@@ -52,8 +55,8 @@ class _Shape:
 def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]:
     """Fit the initial states and latent forces of windows.
 
-    ``noise``: whose shares are those of these windows. Returns the most probable initial state and
-    unit latent forces of each, shape (D + L,), and the log-likelihood of its residuals, but for the
+    ``noise``: with the shares of these windows. Returns the most probable initial state and
+    independent latents of each, shape (D + L,), and the log-likelihood of its residuals without the
     powers of 2 pi, shape (W,).
 
     Raises DiagnoseError: the normal equations are not positive definite, which only broken
@@ -68,12 +71,13 @@ def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]
 
 
 def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray]:
-    """Return the log-likelihood of windows, its gradient and expected curvature by the logarithms
-    of the windows' own levels.
+    """Return the log-likelihood of each window, its gradient and its expected curvature with
+    respect to the logarithms of the window's noise levels.
 
-    Raises DiagnoseError: as :func:`fitted`. Returns values (W,); gradients (W, B + C) by the B
-    blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales
-    share with the fitted columns is given to the channels by their part in them."""
+    Raises DiagnoseError: as :func:`fitted`. Returns values (W,); gradients (W, B + C) by the
+    standard deviations of B blocks and the scales of C channels; curvatures (W, B + C, B + C). The
+    coupling of scales and fitted columns is divided among the channels by their degrees of
+    freedom."""
 
     parts = parallel_map(_evaluate, grams, _shapes(grams, noise))
     return tuple(map(np.array, zip(*parts)))
@@ -85,7 +89,9 @@ def _shapes(grams: Sequence[Gram], noise: Noise) -> list[_Shape]:
 
 
 def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:
-    """Factorise a window's normal equations; ``share``: of its phase's levels, shape (B,)."""
+    """Factorise a window's normal equations; ``share``: its latent deviations relative to those of
+    its phase, shape (B,).
+    """
     levels = [noise.latent_sd.get((block, gram.phase), 0.0) for block in range(BLOCKS)]
     of_latents = (levels * share)[gram.latent_block]
     level = np.append(np.ones(gram.nuisances), of_latents)
@@ -98,15 +104,15 @@ def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:
 
 
 def _inner(gram: Gram) -> ndarray:
-    """Return the inner products of what is integrated out, shape (C, n, n)."""
+    """Return the inner products of the columns that are integrated out, shape (C, n, n)."""
     return gram.inner[:, : gram.hidden, : gram.hidden]
 
 
 def _factor(normal: ndarray, gram: Gram) -> ndarray:
     """Return the lower Cholesky factor of a window's normal equations.
 
-    Levels of many orders of magnitude, as a search for them may try, leave the identity below
-    rounding: then the diagonal grows a little."""
+    The search for noise levels may try extreme ones, beside which the identity is lost in rounding.
+    Then the diagonal is increased a little."""
     for growth in (0.0, ROUNDING):
         try:
             return np.linalg.cholesky(normal + growth * np.diag(np.diag(normal)))
@@ -121,10 +127,10 @@ def _evaluate(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
     inner = _inner(gram)
     covariance = shape.root.T @ shape.root
     variance = np.diag(covariance)
-    # what the posterior variances of [b, a] leave of each channel's squares
+    # contribution of the posterior variances of [b, a] to each channel's sum of squares
     spread = np.einsum("cij,ij->c", inner, covariance * np.outer(shape.level, shape.level))
-    # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
-    # kept from taking others.
+    # Degrees of freedom that the columns take from each channel, limited because of rounding where
+    # derivatives are huge.
     taken = np.clip(shape.weight * spread, 0.0, gram.count)
     in_blocks = np.zeros((BLOCKS, len(variance)))
     in_blocks[gram.latent_block, np.arange(gram.nuisances, gram.hidden)] = 1.0
@@ -146,17 +152,17 @@ def _evaluate(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
 
 
 class Integrals:
-    """The part of windows' statistics that no residual changes."""
+    """The part of windows' statistics that does not depend on the residuals."""
 
     def __init__(self, grams: Sequence[Gram], noise: Noise):
-        """Integrate initial states and latent forces out; ``noise``: as of :func:`fitted`.
+        """Integrate initial states and latent forces out; ``noise``: as in :func:`fitted`.
 
-        Raises DiagnoseError: as :func:`fitted`; information came out negative beyond rounding."""
+        Raises DiagnoseError: as :func:`fitted`, or the information is negative beyond rounding."""
         self._shapes = _shapes(grams, noise)
         # L^-1 P^1/2 U' W S of each window, shape (n, K)
         self._halves = parallel_map(_half, grams, self._shapes)
         count = max(half.shape[1] for half in self._halves)
-        # of windows with fewer effects, the last are 0
+        # windows with fewer effects have zeros for the last ones
         information = np.zeros((len(grams), count, count))
         for row, gram, shape, half in zip(information, grams, self._shapes, self._halves):
             effects = gram.inner[:, gram.hidden :, gram.hidden :]
@@ -172,9 +178,11 @@ class Integrals:
         return np.array([shape.log_det for shape in self._shapes])
 
     def statistics(self, grams: Sequence[Gram], theta: ndarray) -> Statistics:
-        """Return the statistics of windows with the residuals of grams of the same derivatives.
+        """Return the statistics of windows with other residuals; ``grams``: with the same
+        derivatives.
 
-        ``theta``: where these residuals are, in floors; the sizes of further effects are 0."""
+        ``theta``: sizes at which these residuals were simulated, in floors; 0 for effects
+        beyond."""
         score = np.zeros(self._information.shape[:2])
         for row, gram, shape, half in zip(score, grams, self._shapes, self._halves):
             effects = shape.weight @ gram.cross[:, gram.hidden :]
@@ -187,6 +195,8 @@ class Integrals:
 
 
 def _half(gram: Gram, shape: _Shape) -> ndarray:
-    """Return what a window's effects share with what is integrated out, shape (n, K)."""
+    """Return the whitened inner products of a window's integrated columns and its effects, shape
+    (n, K).
+    """
     right = gram.inner[:, : gram.hidden, gram.hidden :]
     return shape.root @ (shape.level[:, None] * np.einsum("c,cij->ij", shape.weight, right))

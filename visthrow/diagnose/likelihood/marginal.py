@@ -1,19 +1,17 @@
-"""From windows of residuals to what they say about the effects: information and score of every
-flight.
+"""Reduce windows of residuals to the information and score of each flight about the effects.
 
 Initial states b and latent forces a are integrated out. With U = [X, G], prior covariance P of (b,
 a) and sensor noise W^-1,
 
     V = W^-1 + U P U',   V^-1 = W - W U (P^-1 + U'W U)^-1 U'W   (Woodbury)
 
-so a window of thousands of samples becomes a few inner products (:class:`Gram`), and a change of
-noise levels costs one small factorisation. Where noise is correlated
-(:mod:`visthrow.diagnose.likelihood.correlation`), they are those of whitened columns. The latent
-forces of one block and axis are an Ornstein-Uhlenbeck process at the knots; its Cholesky factor is
-multiplied into G once, after which P is diagonal.
+so a window of thousands of samples is reduced to a few inner products (:class:`Gram`), and new
+noise levels cost one small factorisation. Where noise is correlated
+(:mod:`visthrow.diagnose.likelihood.correlation`), the columns are whitened first. The latent forces
+of one block and axis are an Ornstein-Uhlenbeck process at the knots. G is multiplied by its
+Cholesky factor once; then P is diagonal.
 
-Effects are measured in floors throughout: theta = 1 is the size below which an effect does not
-matter."""
+Sizes of effects are in floors: theta = 1 is the negligible size."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,21 +26,19 @@ from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Window
 
 TAIL = 6.0
-"""Degrees of freedom of the latent forces' scale mixture: from window to window their deviation
-varies by some 30 %, and a window in which something happened may have ten times as much at the
-price of 11 nats.
+"""Degrees of freedom of the latent forces' scale mixture. Their standard deviation varies by some
+30 % between windows; ten times as much in one window costs 11 nats.
 """
 
-
 ROUNDING = 1e-10
-"""Share of an effect's squares that has to be left once initial states and latent forces took
-theirs: what is less is the difference of numbers that are equal to their last digits, and says
-nothing.
+"""Smallest share of an effect's sum of squares that initial states and latent forces may leave. A
+smaller share is the difference of numbers that agree to their last digits, and carries no
+information.
 """
 
 NEGATIVE = 1e-3
-"""Largest negative eigenvalue of the information, relative to its diagonal, that rounding leaves:
-some 1e-13 of an effect's squares, of which `ROUNDING` are left at least.
+"""Largest negative eigenvalue of the information, relative to its diagonal, that rounding can
+cause: some 1e-13 of an effect's sum of squares, of which at least `ROUNDING` remains.
 """
 
 
@@ -51,7 +47,7 @@ class Gram:
     """Weighted inner products of one window's columns, by channel; D nuisances, L latents, K
     effects, P = D + L + K.
 
-    The columns stand in the order nuisances (times their prior deviation), latents, effects (times
+    The order of the columns is: nuisances (times their prior deviation), latents, effects (times
     their floors)."""
 
     flight: int
@@ -62,13 +58,14 @@ class Gram:
     square: ndarray  # r' r / sigma^2, shape (C,)
     nuisances: int
     latent_block: ndarray  # shape (L,)
-    # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    # from independent latents to the forces at the knots: G_used = G @ factor, shape (L, L)
     factor: ndarray
-    log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
+    # sum over all samples; makes grams comparable whose outliers have different weights
+    log_sigma: float = 0.0
 
     @property
     def latents(self) -> int:
-        """Number of latent-force coefficients."""
+        """Return the number of latent-force coefficients."""
         return len(self.latent_block)
 
     @cached_property
@@ -83,7 +80,7 @@ class Gram:
 
     @property
     def hidden(self) -> int:
-        """Number of columns that are integrated out: nuisances and latents."""
+        """Return the number of columns that are integrated out: nuisances and latents."""
         return self.nuisances + self.latents
 
 
@@ -109,8 +106,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Everything that F flights, or windows or groups of either, say about K effects, in floors,
-    about the linearisation point ``theta``.
+    """Sufficient statistics of F flights (or windows, or groups of either) about K effects, in
+    floors, at the linearisation point ``theta``.
     """
 
     flights: ndarray  # number of each row's flight or group, shape (F,)
@@ -123,11 +120,11 @@ class Statistics:
 
     @cached_property
     def absolute(self) -> "Statistics":
-        """Return the statistics about theta = 0."""
+        """Return the statistics at theta = 0."""
         return self.about(np.zeros(self.score.shape[1]))
 
     def about(self, theta: ndarray) -> "Statistics":
-        """Return the statistics of the residuals extrapolated to other sizes, shape (K,), or to
+        """Return the statistics extrapolated to other sizes: the same for all rows, shape (K,), or
         those of each row, shape (F, K).
         """
         change = np.broadcast_to(self.theta - theta, self.score.shape)
@@ -136,7 +133,7 @@ class Statistics:
         return replace(self, score=score, square=square, theta=theta)
 
     def first(self, count: int) -> "Statistics":
-        """Return what is said of the first effects alone; the others keep their sizes."""
+        """Return the statistics of the first effects alone, with the others at their sizes."""
         return replace(
             self,
             information=self.information[:, :count, :count],
@@ -149,7 +146,7 @@ class Statistics:
         return self._with_rows(self.flights[keep], lambda values: values[keep])
 
     def by(self, groups: Sequence[int]) -> "Statistics":
-        """Add up rows by group; ``groups``: number of each row's, shape (F,)."""
+        """Add up the rows of each group; ``groups``: the group of each row, shape (F,)."""
         numbers = np.unique(groups)
         members = np.equal.outer(numbers, groups).astype(float)
         return self._with_rows(numbers, lambda values: np.tensordot(members, values, 1))
@@ -162,7 +159,7 @@ class Statistics:
 
 
 def columns(window: Window, floors: ndarray) -> ndarray:
-    """The columns [X, G, S] of a window as :class:`Gram` scales them, shape (N, P)."""
+    """Return the columns [X, G, S] of a window, scaled as in :class:`Gram`, shape (N, P)."""
     latent = window.latent if window.latent.size else np.zeros((len(window.residual), 0))
     states = window.nuisance * window.nuisance_sd
     return np.hstack((states, latent, window.effects * floors))
@@ -217,13 +214,13 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 
 
 def without_effects(gram: Gram) -> Gram:
-    """Return a Gram matrix of nuisances and latents alone."""
+    """Return the Gram matrix of nuisances and latents alone."""
     inner = np.ascontiguousarray(gram.inner[:, : gram.hidden, : gram.hidden])
     return replace(gram, inner=inner, cross=gram.cross[:, : gram.hidden])
 
 
 def in_one_channel(gram: Gram, scale: ndarray) -> Gram:
-    """Return a Gram matrix whose samples are all of one channel with the noise that they state.
+    """Return a Gram matrix that has one channel for all samples, weighted by their noise.
 
     ``scale``: of each channel's sigma, shape (C,)."""
     weight = scale**-2.0
@@ -238,14 +235,14 @@ def in_one_channel(gram: Gram, scale: ndarray) -> Gram:
 
 
 def with_latent_effects(gram: Gram) -> Gram:
-    """Return a Gram matrix whose unit latents are effects as well, behind the others."""
+    """Return a Gram matrix in which the latents are repeated as effects, after the others."""
     columns = np.r_[: len(gram.cross[0]), gram.nuisances : gram.hidden]
     inner = gram.inner[:, columns[:, None], columns]
     return replace(gram, inner=inner, cross=gram.cross[:, columns])
 
 
 def whitened(window: Window, values: ndarray) -> ndarray:
-    """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
+    """Whiten columns in sigmas, shape (N, P), in place, and return them."""
     for rows, factor in window.correlated:
         group = values[rows].reshape(len(rows), -1)
         white = lapack.dtrtrs(factor, group, lower=1)[0]
@@ -254,9 +251,9 @@ def whitened(window: Window, values: ndarray) -> ndarray:
 
 
 def check(window: Window, effects: int, channels: int) -> None:
-    """Refuse a window whose arrays do not fit together.
+    """Check the arrays of a window.
 
-    Raises DiagnoseError: they do not, or hold NaN or infinity.
+    Raises DiagnoseError: their shapes disagree, or they hold NaN or infinity.
     """
     n = len(window.residual)
     where = f"window of flight {window.flight}, phase {window.phase}"
@@ -285,16 +282,15 @@ def check(window: Window, effects: int, channels: int) -> None:
 
 
 def finite(window: Window) -> bool:
-    """Whether a window was simulated."""
+    """Return whether the simulation of a window stayed finite."""
     arrays = window.residual, window.effects, window.nuisance, window.latent
     return all(np.all(np.isfinite(array)) for array in arrays)
 
 
 def correlated(gram: Gram, window: Window, time: float) -> Gram:
-    """Multiply the Cholesky factor of Ornstein-Uhlenbeck latents into a Gram whose factor is still
-    the identity.
+    """Correlate the latent forces of a Gram matrix whose ``factor`` is the identity.
 
-    ``window``: for the knots; ``time``: correlation time [s]; latent forces at knots dt apart
+    ``window``: for the knots; ``time``: correlation time [s]. Latent forces at knots dt apart
     correlate by exp(-dt/time)."""
     if not gram.latents:
         return gram
@@ -310,8 +306,8 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
 
 
 def knot_factor(window: Window, time: float) -> ndarray:
-    """Cholesky factor of a window's latents of one block and axis, which is that of all others; see
-    :func:`correlated`.
+    """Return the Cholesky factor of a window's latents of one block and axis; all blocks and axes
+    share it. See :func:`correlated`.
     """
     knots = np.unique(window.latent_time)
     lag = np.abs(knots[:, None] - knots)
@@ -334,14 +330,12 @@ def with_residuals(
     floors: ndarray,
     residuals: Sequence[ndarray],
 ) -> list[Gram]:
-    """Return Gram matrices with other residuals, see :func:`with_residual`."""
+    """Replace the residuals of Gram matrices, see :func:`with_residual`."""
     return parallel_map(partial(with_residual, floors=floors), grams, windows, residuals)
 
 
 def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray) -> Gram:
-    """Return a Gram matrix of the same derivatives with the residuals of another size of the
-    effects.
-    """
+    """Return a Gram matrix with another residual and the same derivatives."""
     count = len(residual)
     channels = len(gram.count)
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
@@ -357,7 +351,7 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
 
 
 def _unwhiten(window: Window, white: ndarray) -> ndarray:
-    """Transpose of :func:`whitened`, of one column, shape (N,)."""
+    """Apply the transpose of :func:`whitened` to one column, shape (N,)."""
     out = white.copy()
     for rows, factor in window.correlated:
         out[rows] = lapack.dtrtrs(factor, white[rows], lower=1, trans=1)[0]
@@ -365,8 +359,8 @@ def _unwhiten(window: Window, white: ndarray) -> ndarray:
 
 
 def residual_after_fit(window: Window, fit: ndarray) -> ndarray:
-    """Return the residual after a fit of initial state in prior deviations and latents at the
-    knots, shape (D + L,); shape (N,).
+    """Return the residual that a fit leaves, shape (N,); ``fit``: initial state in prior deviations
+    and latents at the knots, shape (D + L,).
     """
     states = window.nuisance.shape[1]
     residual = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
@@ -376,9 +370,9 @@ def residual_after_fit(window: Window, fit: ndarray) -> ndarray:
 
 
 def without_rounding(information: ndarray, grams: Sequence[Gram]) -> ndarray:
-    """Return windows' information without what rounding left of it, shape (W, K, K).
+    """Set information that is mere rounding to 0, and make the sum positive; shape (W, K, K).
 
-    Raises DiagnoseError: it came out negative beyond rounding."""
+    Raises DiagnoseError: the sum has a negative eigenvalue beyond rounding."""
     size = information.shape[1]
     squares = np.zeros(size)
     for gram in grams:
@@ -396,8 +390,8 @@ def without_rounding(information: ndarray, grams: Sequence[Gram]) -> ndarray:
             " are broken"
         )
     if lowest < 0.0:
-        # rounding, which wide priors of several named effects would turn into evidence; what says
-        # nothing of an effect stays silent
+        # Wide priors of several selected effects would turn this rounding into evidence.
+        # Information of 0 stays 0.
         diagonal = np.arange(size)
         information[:, diagonal, diagonal] *= 1.0 - 2.0 * lowest
     return information

@@ -1,10 +1,9 @@
-"""Noise levels: sensor noise from differences of neighbours, latent forces from the likelihood of
-all windows.
+"""Estimate noise levels: scales of sensor noise, and standard deviations of latent forces.
 
-A pure fit of everything by maximum likelihood is pulled away by one bad window; hence three guards,
-each tested by a planted fault: single samples far outside lose weight (Huber), a window's latent
-forces may be stronger or weaker than its phase's (their variance has an inverse gamma prior about
-it, so that the forces have Student's heavy tails), and every level is bounded."""
+One bad window would spoil a plain maximum-likelihood fit. Three guards prevent this, and a test
+plants a fault for each. Single samples far out lose weight (Huber). A window's latent forces may be
+stronger or weaker than those of its phase: their variance has an inverse gamma prior, so the forces
+have the heavy tails of a Student distribution. Every level is bounded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,42 +27,44 @@ from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
 
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
-"""Of latent forces [s]: from one knot to longer than a window, the candidates of :func:`fit`."""
+"""Correlation times of latent forces that :func:`fit` compares [s]: from one knot to longer than a
+window.
+"""
 
-SCALE_BOUNDS = (0.3, 10.0)  # of a channel's sigma against what the model said
+SCALE_BOUNDS = (0.3, 10.0)  # of a channel's sigma, relative to the stated one
 
 LEVEL_LOW = 1e-2
 LEVEL_HIGH = 1e4
-"""Latent deviations, in the level at which they become visible.
+"""Bounds of latent deviations, relative to the level at which they become visible.
 
-A hundredth of it is as good as none: thousands of knots together do not show it, and far below it
-slopes are lost in rounding.
+A hundredth of that level is as good as 0: even thousands of knots together do not show it. Far
+below it, gradients are lost in rounding.
 """
 
-HUBER = 6.0  # sigmas from which a sample loses weight
-# more samples than this beyond ``HUBER`` are no outliers but a misfit, which must stay visible
+HUBER = 6.0  # distance in sigmas from which a sample loses weight
+# a larger share beyond ``HUBER`` is no outlier but a modelling error, which must stay visible
 HUBER_SHARE = 0.02
-SHARE_BOUNDS = (0.1, 1e3)  # latent deviation of a window, in its phase's
+SHARE_BOUNDS = (0.1, 1e3)  # of a window's latent deviation, relative to its phase's
 
 PRIOR_CURVATURE = (0.05, 2.0)
-"""Limits of the prior's curvature by the logarithm of a window's share, in that at 1: it falls
-where windows stand far out.
+"""Limits of the curvature of the prior by the logarithm of a window's share, relative to that at a
+share of 1. It is small for windows far from the others.
 """
 
 CLEANINGS = 4  # rounds in which outliers lose weight
-# latent forces while outliers are looked for, in the level at which they become visible
+# latent deviation during the search for outliers, relative to the level at which it is visible
 WIDE = 30.0
 
 ITERATIONS = 40
 ENOUGH_NATS = 0.2
-"""A step that promises less is the last in the search for the levels, and leaves some twentieth of
-it.
+"""The search for the levels ends with a step that promises less; about a twentieth of it
+remains.
 """
 ROUGHLY_NATS = 1.0  # the same while correlation times are compared
-# of the logarithm of a level in one step: its variance may be predicted to fall below 0
+# largest decrease of a level's logarithm in one step: a step of the variance may lead below 0
 LONGEST_FALL = 1.0
 HALVINGS = 8
-STALLED = 1e-3  # of a level: limits count as met within this share of it
+STALLED = 1e-3  # of a level: limits count as reached within this share of it
 
 
 def fit(
@@ -74,9 +75,9 @@ def fit(
     """Estimate sensor scales, latent deviations by block and phase, and their correlation time.
 
     ``windows``: for the knots of the latent forces; ``grams``: of the windows, with ``factor`` the
-    identity; ``start``: an earlier estimate: its correlation time is kept, its levels are where the
-    search starts. Returns the levels, and the grams with correlated latent forces that belong to
-    them."""
+    identity; ``start``: an earlier estimate, which gives the correlation time and the levels from
+    which the search starts. Returns the levels, and the grams with their latent forces correlated
+    accordingly."""
     noise = start
     time = CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):
@@ -88,9 +89,10 @@ def fit(
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
-    """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
-    has one maximum over it.
-    """
+    """Return rough levels with the likeliest correlation time.
+
+    The likelihood has one maximum over the correlation time, so the search climbs from the middle
+    one."""
     bare = [without_effects(gram) for gram in grams]
     levels_of = {}
 
@@ -113,8 +115,8 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
-    """The levels as they concern some of the windows, whose ``grams`` these are, and a first guess
-    of others.
+    """Return the levels for some of the windows, whose ``grams`` these are; levels that are not
+    known yet are guessed.
     """
     guess = _guess(grams).latent_sd
     levels = {key: noise.latent_sd.get(key, level) for key, level in guess.items()}
@@ -122,20 +124,22 @@ def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
 
 
 def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, float]:
-    """Rough levels of grams with correlated latents, and their log-likelihood; ``start``: levels of
-    like grams, to search from.
+    """Return rough levels of grams with correlated latents, and their log-likelihood; ``start``:
+    levels of similar grams, from which the search starts.
     """
     guess = only(start, grams, range(len(grams))) if start else _guess(grams)
     return maximised(grams, guess, ROUGHLY_NATS)
 
 
 def _guess(grams: Sequence[Gram]) -> Noise:
-    """Sensor noise as stated, latent forces where they just become visible."""
+    """Return the stated sensor noise, and latent forces at the level at which they become
+    visible.
+    """
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
     for gram in grams:
         for block, information in gram.visibility.items():
-            if information > 0.0:  # else these forces show nowhere in the window
+            if information > 0.0:  # else these forces have no effect on the window
                 levels = visible.setdefault((block, gram.phase), [])
                 levels.append(1.0 / np.sqrt(information))
     medians = {key: np.median(levels) for key, levels in visible.items()}
@@ -145,14 +149,14 @@ def _guess(grams: Sequence[Gram]) -> Noise:
 
 @dataclass(frozen=True)
 class _Layout:
-    """The places of levels among the parameters of the search: phases' levels, windows' shares of
-    them by block, sensor scales.
+    """The order of the search's parameters: the phases' levels, each window's share of them by
+    block, sensor scales.
 
-    What shows nowhere has no slope, and stays as it is."""
+    A parameter without effect has a gradient of 0, and keeps its value."""
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
-    phases: ndarray  # number of the level that each share is of, shape (W B,)
-    # numbers of what moves each window: its phase's levels, scales, and shares, shape (W, 2 B + C)
+    phases: ndarray  # index of the level to which each share belongs, shape (W B,)
+    # indices of each window's parameters: its phase's levels, scales, shares, shape (W, 2 B + C)
     places: ndarray
 
     @staticmethod
@@ -174,17 +178,17 @@ class _Layout:
 
     @property
     def shares(self) -> slice:
-        """Return the place of the windows' shares among the parameters."""
+        """Return the range of the windows' shares among the parameters."""
         first = len(self.keys)
         return slice(first, first + len(self.phases))
 
     def pack(self, noise: Noise) -> ndarray:
-        """Logarithms of all levels, shape (P,)."""
+        """Return the logarithms of all levels, shape (P,)."""
         levels = [noise.latent_sd[key] for key in self.keys]
         return np.log(np.concatenate((levels, noise.share.ravel(), noise.scale)))
 
     def unpack(self, x: ndarray, noise: Noise) -> Noise:
-        """The levels; ``noise`` tells all others."""
+        """Return the levels from their logarithms; everything else is taken from ``noise``."""
         sizes = np.exp(x)
         shares = self.shares
         levels = dict(zip(self.keys, sizes.tolist()))
@@ -192,7 +196,7 @@ class _Layout:
         return replace(noise, scale=sizes[shares.stop :], share=share, latent_sd=levels)
 
     def limits(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
-        """Lowest and highest values of the parameters."""
+        """Return the lowest and highest values of the parameters."""
         guess = _guess(grams).latent_sd
         visible = [guess[key] for key in self.keys]
         channels = len(grams[0].count)
@@ -207,18 +211,19 @@ class _Layout:
 def maximised(
     grams: Sequence[Gram], noise: Noise, tolerance: float = ENOUGH_NATS
 ) -> tuple[Noise, float]:
-    """Most probable logarithms of all levels, with exact gradients and explicit limits.
+    """Maximise the posterior probability of all levels' logarithms within their limits, by Fisher
+    scoring.
 
-    By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at
-    all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
-    promises less is the last."""
+    The expected curvature costs little more than the gradient, and a few evaluations suffice.
+    ``noise``: where the search starts; ``tolerance``: the search ends with a step that promises
+    less [nats]. Returns the levels and their log-likelihood."""
     layout = _Layout.numbered(grams, noise)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
     value, slope, curvature = _likelihood(grams, layout.unpack(x, noise), layout)
     for _ in range(ITERATIONS):
         step, promised = _scoring_step(layout, x, slope, curvature, low, high)
-        if promised < tolerance:  # it is taken without another look
+        if promised < tolerance:  # the step is taken without an evaluation
             return layout.unpack(x + step, noise), value + 0.5 * promised
         for _ in range(HALVINGS):
             levels = layout.unpack(x + step, noise)
@@ -246,12 +251,12 @@ def _scoring_step(
     low: ndarray,
     high: ndarray,
 ) -> tuple[ndarray, float]:
-    """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that
-    it promises.
+    """Return Fisher's step of the variances within the limits, expressed in logarithms of the
+    levels, and the gain that it promises [nats].
 
-    What a limit holds back stays there, and the others move without it. A variance far too small
-    shows in no likelihood's logarithm, but its own step is finite. A window's variance takes the
-    steps of its phase's level and of its share together."""
+    Parameters held by a limit stay there while the others move. If a variance is far too small, the
+    gradient by its logarithm vanishes, but the step of the variance itself is finite. A window's
+    variance takes the steps of its phase's level and of its share together."""
     diagonal = np.diag(curvature)
     at_low = (x <= low + STALLED) & (slope < 0.0)
     at_high = (x >= high - STALLED) & (slope > 0.0)
@@ -274,15 +279,15 @@ def _scoring_step(
 
 
 def _logarithms(step: ndarray) -> ndarray:
-    """Changes of levels' logarithms by steps of their variances, which are linear in small ones."""
+    """Convert steps of variances, relative to them, into changes of the levels' logarithms."""
     return 0.5 * np.log1p(np.maximum(2.0 * step, np.expm1(-2.0 * LONGEST_FALL)))
 
 
 def _likelihood(
     grams: Sequence[Gram], noise: Noise, layout: _Layout
 ) -> tuple[float, ndarray, ndarray]:
-    """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
-    expected curvature.
+    """Return the log-likelihood with the prior of the windows' shares, its gradient by the
+    parameters and its expected curvature.
     """
     values, slopes, curvatures = look(grams, noise)
     places = layout.places
@@ -301,11 +306,11 @@ def _likelihood(
 
 
 def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[Window]:
-    """Give single samples far outside a sigma that puts them at HUBER; windows with none are
-    returned as they are.
+    """Increase the sigma of outliers so that they lie at HUBER; windows without outliers are
+    returned unchanged.
 
-    Latent forces have a wide prior here, so that a missing effect is followed and only what no
-    force can do stands out. ``grams``: of the windows, with ``factor`` the identity."""
+    Latent forces have a wide prior here. They can follow any missing effect, so a sample that they
+    cannot follow is an outlier. ``grams``: of the windows, with ``factor`` the identity."""
     sigmas = [window.sigma for window in windows]
     windows_left = list(range(len(windows)))
     starts = list(windows)
@@ -328,8 +333,8 @@ def without_outliers(windows: Sequence[Window], grams: Sequence[Gram]) -> list[W
 
 
 def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarray]:
-    """Initial states in prior deviations and latents at the knots that explain most, with wide
-    priors of the latents.
+    """Fit initial states, in prior deviations, and latents at the knots, with wide priors of the
+    latents.
     """
     time = CORRELATION_TIMES[0]
     shaped = correlated_of(bare, windows, time)
@@ -347,13 +352,15 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarr
 
 
 def _outlier_distances(window: Window, residual: ndarray) -> ndarray:
-    """Return how far samples lie outside, in the distance at which they are far, shape (N,)."""
+    """Return the distances of samples relative to that at which they become outliers, shape
+    (N,).
+    """
     normal = np.abs(residual) / window.sigma
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
 
 
 def _with_sigmas(window: Window, sigma: ndarray) -> Window:
-    """The window with other sigmas, where these differ in a few samples."""
+    """Return the window with other sigmas if only a few of them differ, else unchanged."""
     share = (sigma > window.sigma).mean()
     if 0.0 < share <= HUBER_SHARE:
         return replace(window, sigma=sigma)

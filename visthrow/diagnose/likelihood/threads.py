@@ -1,7 +1,7 @@
-"""Threads of the linear algebra: its matrices are of some hundred rows, on which several threads a
-product wait for each other.
+"""Threads of the linear algebra.
 
-So each product has one thread, and windows are spread over the cores."""
+Matrices have some hundred rows, so several threads would slow a matrix product down. Each product
+uses one thread, and windows are distributed over the cores."""
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -15,14 +15,12 @@ from sim.cores import cores as cores
 T = TypeVar("T")
 R = TypeVar("R")
 
-THREADS = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
-PIECES = 4  # of what is to be done, for each thread
+THREADS = 4  # with 8, a diagnosis on 16 cores took an eighth longer, because of Python's lock
+PIECES = 4  # pieces of work for each thread
 
 
 def limit_to_one_thread() -> None:
-    """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this
-    process has loaded.
-    """
+    """Limit the BLAS libraries that this process has loaded, of numpy and scipy, to one thread."""
     import scipy.linalg  # noqa: F401
 
     threadpool_limits(1)
@@ -34,9 +32,9 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def parallel_map(function: Callable[..., R], *columns: Iterable[Any]) -> list[R]:
-    """Map a function over items, in order, on all cores; no call may wait for another of these.
+    """Map a function over items, in order, on all cores; no call may wait for another one.
 
-    ``columns``: one for each argument, as the built-in ``map`` takes them.
+    ``columns``: one for each argument, as for the built-in ``map``.
     """
     items = list(zip(*columns))
     threads = min(cores(), THREADS)
@@ -44,7 +42,7 @@ def parallel_map(function: Callable[..., R], *columns: Iterable[Any]) -> list[R]
         return [function(*item) for item in items]
     pieces = min(
         PIECES * threads, len(items)
-    )  # each item by itself would cost as much as the small ones take
+    )  # submitting items one by one would cost as much as computing small ones
     parts = _pool(threads).map(
         lambda first: [function(*item) for item in items[first::pieces]], range(pieces)
     )
