@@ -1,12 +1,11 @@
-"""Mistakes between a log and the simulation that are either there or not: axes, signs and units of
-the commands.
+"""Suspect mistakes in the commands of a log: axes, signs and units.
 
-Here they are suspected, from how measured rates follow commanded ones and from the weight that
-commands carry. They are candidates of the selection like any other:
-:func:`visthrow.diagnose.select.diagnose_flights.correct_interface_mistakes` simulates the
-flights with and without each, and keeps what raises the evidence by more than it costs. (Commands
-that bear the time of their arrival are no gross mistake: they show as the effect ``cmd_delay`` on
-its bound, the link's delay less.)
+Suspicions come from the way in which measured rates follow commanded ones, and from the weight that
+commanded thrust carries.
+:func:`visthrow.diagnose.select.diagnose_flights.correct_interface_mistakes` simulates the flights
+with and without each mistake, and corrects those that raise the evidence by more than their
+penalty. (Commands stamped at their arrival are no such mistake: they show as the effect
+``cmd_delay``, at its bound minus the link's delay.)
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,39 +21,39 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import nearest
 
-# correlation of commanded and measured rates, with whichever axes, from which a log tells of its
-# commands
+# smallest correlation of commanded and measured rates, in the best axes, at which a log is used
 FOLLOWS = 0.8
-MOVES = 0.3  # rates that say something about their axes [rad/s]
-LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
-VARIED = 0.05  # of the throttle's hover, from which its variation tells the slope of thrust
-LATE = 0.05  # by which motors lag behind throttle [s]
+MOVES = 0.3  # smallest standard deviation of rates that shows their axes [rad/s]
+LIFTED = 0.15  # height above the start from which a vehicle counts as flying [m]
+VARIED = 0.05  # smallest variation of throttle, relative to hover, that shows the slope of thrust
+LATE = 0.05  # lag of the motors behind throttle [s]
 SLOPES = (0.3, 2.0)  # plausible slopes of thrust over throttle
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """One hypothesis about the logs' commands."""
+    """A possible mistake in the commands of all logs."""
 
     name: str
     cause: str  # in words
-    equation: str  # what puts it right
-    nats: float  # by which it beats the log as it stands
-    logs: int  # that can tell
-    ways: int = 1  # that commands may be wrong in so: their logarithm is the price
-    # of the command (thrust and rates), shape (4, 4); none where it was made anew
+    equation: str  # the correction
+    nats: float  # evidence for it
+    logs: int  # number of logs that show it
+    ways: int = 1  # number of alternatives of the same kind; its logarithm is the penalty
+    # matrix of the correction of thrust and rates, shape (4, 4); empty where the command was
+    # derived
     change: Sequence[Sequence[float]] = ()
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """Describe the mistake and its correction for the report."""
         return (
             f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs}"
             " logs. It was put right."
         )
 
     def mended(self, log: FlightLog) -> FlightLog:
-        """The log with the commands that were meant."""
+        """Return the log with corrected commands."""
         if "command" not in log:
             return log
         c = log["command"]
@@ -63,8 +62,8 @@ class Mistake:
 
 
 def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
-    """Return what may be wrong with the commands of all logs, in the order of correction; not
-    weighed yet.
+    """List possible mistakes in the commands of all logs, in the order of correction. Their
+    evidence is not yet known.
     """
     full = 4.0 * plant.vehicle.controller.max_thrust
     units = thrust_checks.UNITS | {"shares of the full thrust": full}
@@ -81,12 +80,12 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
 def commanded(
     logs: Sequence[FlightLog], plant: PlantParams
 ) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
-    """Logs of autopilots with commands made of throttle and commanded rates, cut to where they fly,
-    and what was made.
+    """Derive commands from throttle and commanded rates where an autopilot's log has no commands.
 
     Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share
-    h of full throttle. The slope s is fitted where an accelerometer tells the force and the
-    throttle varies enough, else it is 1."""
+    h of full throttle. The slope s is fitted if an accelerometer measures the force and the
+    throttle varies enough; otherwise it is 1. Returns the logs, cut to the time in flight, and what
+    was derived."""
     weight = GRAVITY * plant.total_mass
     corrected = list(logs)
     shares = []
@@ -118,8 +117,8 @@ def commanded(
 
 
 def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
-    """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None
-    where nothing flies.
+    """Return the throttle in hover, the slope of the thrust there, and the first and last time in
+    flight [s]; None if the vehicle does not fly.
     """
     throttle = log["throttle"].samples()
     time = throttle.time
@@ -149,7 +148,9 @@ def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
 
 
 def _relate_rates(log: FlightLog) -> relations.Relation | None:
-    """Return how the measured attitude's rates follow the commanded ones; None if nothing turns."""
+    """Relate the measured attitude's rates to the commanded ones; None if the vehicle hardly
+    turns.
+    """
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or len(attitude.time) < 50:
         return None
@@ -162,8 +163,8 @@ def _relate_rates(log: FlightLog) -> relations.Relation | None:
 
 
 def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
-    """Exchanged or turned axes of the commanded rates, where all logs that say so say the same, and
-    they are most.
+    """Return exchanged or reversed axes of the commanded rates, if most logs show them and all of
+    these agree.
     """
     clear = [r for r in relation if r.nats > 0.0]
     if len({r.axes for r in clear}) != 1 or 2 * len(clear) < len(relation):
@@ -181,7 +182,7 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
-    """Degrees for radians, or radians for degrees, in the commanded rates."""
+    """Return a wrong unit of the commanded rates: degrees for radians, or the reverse."""
     gain = np.median([r.scale for r in relation if r.correlation > FOLLOWS] or [1.0])
     factors = {
         "radians a second": 1.0,
@@ -202,8 +203,8 @@ def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
 def _thrust_unit(
     logs: Sequence[FlightLog], weight: float, units: Mapping[str, float]
 ) -> Mistake | None:
-    """Another unit of the commanded thrust: that in which its median comes nearest to the weight
-    that it carries [N].
+    """Return a wrong unit of the commanded thrust: the one that makes its median closest to the
+    weight that it carries [N].
     """
     commands = [c for log in logs if (c := measured(log, "command")) is not None]
     medians = [np.median(c.values[:, 0]) for c in commands]

@@ -12,20 +12,18 @@ from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight
 
 LENGTH = 1.0  # of a window, about [s]
 SHORTEST = 0.25  # of a window [s]
-BEFORE = 0.55  # the separation, from which the window of the throw reaches [s]
-AFTER = 0.45  # the separation, up to which it reaches [s]
-QUIET_SPEED = 0.35  # of hover [m/s]
-GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
-# by which the release may lag more than expected, before a payload counts as free where the rope
-# was slack [s]
+BEFORE = 0.55  # length of the throw's window before the separation [s]
+AFTER = 0.45  # length of the throw's window after the separation [s]
+QUIET_SPEED = 0.35  # highest mean speed of a hover [m/s]
+GROUND_MARGIN = 0.05  # height above the landing below which the payload's track is not used [m]
+# assumed delay of the release beyond the known lag, where the rope was slack at the release [s]
 LATE = 0.1
-LEAST_TAUT = 0.05  # before the separation, without which the release cannot be judged [s]
-# that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows
-# may
+LEAST_TAUT = 0.05  # shortest taut time before the separation that shows the release [s]
+# time after a rope became taut in which it may whip [s]: it bends more than ropes in calm windows
 RINGING = 1.5
-WINDOW_LIMIT = 100  # windows that are diagnosed in minutes; longer flights are thinned to these
+WINDOW_LIMIT = 100  # windows that are diagnosed within minutes; longer flights are thinned to these
 TINY = 1e-12  # variance of a command that never changes
-POSES_LEAST = 8  # measured poses without which a window says nothing
+POSES_LEAST = 8  # fewest measured poses in a window
 
 
 @dataclass(frozen=True)
@@ -37,13 +35,13 @@ class Cut:
     start: float  # [s]
     end: float  # [s]
     payload: int  # ATTACHED, LOOSE or NO_PAYLOAD, at its start
-    after_slack: bool = False  # whether the rope came taut not long before
-    at_rest: bool = False  # whether the rope hung still until its start
-    retained: bool = True  # whether its residuals count; otherwise it is only flown through
+    after_slack: bool = False  # whether the rope became taut shortly before
+    at_rest: bool = False  # whether the rope hung still until the window's start
+    retained: bool = True  # whether its residuals are used; if not, it only carries the state on
 
 
 def _split(first: float, last: float) -> list[tuple[float, float]]:
-    """Equal pieces of about :data:`LENGTH`."""
+    """Split a span into equal pieces of about :data:`LENGTH`."""
     if last - first < SHORTEST:
         return []
     edges = np.linspace(first, last, max(round((last - first) / LENGTH), 1) + 1)
@@ -59,7 +57,7 @@ def _phase(flight: RecordedFlight, first: float, last: float) -> str:
 
 
 def payload_down(flight: RecordedFlight, landing_height: float) -> float:
-    """Return when the payload is about to come down, or NEVER [s]."""
+    """Return the time at which the payload is about to land, or NEVER [s]."""
     if flight.payload is None or flight.latch == NEVER:
         return flight.landing
     after = flight.payload.time > flight.latch
@@ -70,9 +68,9 @@ def payload_down(flight: RecordedFlight, landing_height: float) -> float:
 def cut(
     flight: RecordedFlight, number: int, lag: float, landing_height: float, carries: bool
 ) -> list[Cut]:
-    """Cut one flight.
+    """Cut one flight into windows.
 
-    ``lag``: of the release, as far as known [s]; ``landing_height``: of the payload's centre [m];
+    ``lag``: known lag of the release [s]; ``landing_height``: of the payload's centre [m];
     ``carries``: whether the flight carries a payload."""
     first = flight.start
     last = flight.end
@@ -92,15 +90,16 @@ def cut(
     cuts: list[Cut] = []
     for start, end, kind, payload in spans:
         phase = kind or _phase(flight, start, end)
-        previous = cuts[-1].phase if cuts else phase  # nothing is known of before the first
+        previous = cuts[-1].phase if cuts else phase  # the motion before the first is unknown
         cuts.append(Cut(number, phase, start, end, payload, at_rest=previous == "hover"))
     return [c for c in cuts if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST]
 
 
 def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
-    """Thin long flights out to all throws and what follows them, and so many of the other windows
-    that :data:`WINDOW_LIMIT` are left: of each stretch that whose commands vary most.
-    """
+    """Thin long flights to :data:`WINDOW_LIMIT` windows.
+
+    All throws and ballistic windows are kept. The others are divided into groups of neighbours, and
+    the window whose commands vary most is kept from each group."""
     plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
     room = max(WINDOW_LIMIT - len(cuts) + len(plain), WINDOW_LIMIT // 4)
     if len(plain) <= room:
@@ -116,17 +115,17 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
 
 
 def _variation(flight: RecordedFlight, c: Cut, whole: ndarray) -> float:
-    """Variance of a window's commands, against that of the whole flight's."""
+    """Return the variance of a window's commands relative to that of the whole flight's."""
     acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
     variance = np.var(flight.command[acts], axis=0)
     return np.sum(variance / np.maximum(whole, TINY))
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
-    """A window cut about the time in which the rope was slack: that is only flown through.
+    """Cut a window around the time in which the rope was slack; the slack part is not retained.
 
-    ``first, last``: of that time [s]; ``separation``: of the payload [s]; a rope that comes taut no
-    sooner leaves a window of the flight after it."""
+    ``first, last``: the slack time [s]; ``separation``: of the payload [s]. If the rope is still
+    slack at the separation, the last piece is the payload's free flight."""
     if c.start < separation < min(last + LEAST_TAUT, c.end):
         last = min(max(last, separation + LATE), c.end)
         afterwards = replace(c, start=last, payload=LOOSE, phase="ballistic")

@@ -1,9 +1,8 @@
-"""Measurements that are predicted without a simulation: where payloads landed, and what a camera
-saw.
+"""Measurements that are predicted without a simulation: heights of landings, and keypoints.
 
-Each kind predicts its samples from what motion capture saw, taken back through the setting's
-delays, frame and markers, so that it depends on sensors, camera and landing plane alone. Its
-samples stand behind the simulated ones of their window."""
+They are predicted from motion-capture poses, from which the setting's delays, frame and marker
+offsets are removed. So they depend on sensors, camera and landing plane alone. Their samples follow
+the simulated ones in each window."""
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -26,18 +25,17 @@ from visthrow.logs.flightlog import FlightLog
 
 LANDING = "landing"
 KEYPOINTS = "keypoints"
-# of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart
+# noise of a logged landing's height [m]: a ball is compressed, and samples are milliseconds apart
 LANDING_SIGMA = 2e-3
-GRID = 0.02  # between the smoothed poses that a camera's views are predicted from [s]
-# reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late
+GRID = 0.02  # spacing of the smoothed poses from which keypoints are predicted [s]
+# half width of that smoothing [s]: attitudes change within 50 ms, which a wider one would delay
 SMOOTHING_SECONDS = 0.025
-# over which the speed of a keypoint is taken [s]: its row differs from the others' by a few
-# milliseconds at most
+# time over which the speed of a keypoint is taken [s]; rows are exposed within a few milliseconds
 SHORT = 1e-3
 LEAST_KEYPOINT_SIGMA = 2e-4  # normalised
 MEASURED = np.array([(1, 1)] * 4 + [(1, 0), (0, 1), (1, 0), (0, 1)], dtype=bool)
-"""Coordinates (8, 2) that a detector measures: corners, and where each side of a box is; the rest
-are middles of sides.
+"""Coordinates (8, 2) that a detector measures: both of a corner, and one of a side of the ball's
+box. The other coordinate of a side is its middle.
 """
 ACTS_ON = (
     "camera.",
@@ -45,7 +43,7 @@ ACTS_ON = (
     "plant.rope.payload_radius",
     "sensing.camera_",
 )
-"""Numbers that nothing but these samples depends on: their effects need no simulation."""
+"""Parameters on which only these samples depend: effects on them need no simulation."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class DirectSamples:
     time: ndarray  # stamps [s], shape (N,)
     values: ndarray  # shape (N,)
     sigma: float
-    predicted: Callable[[Setting], ndarray]  # what a setting makes of them, shape (N,)
+    predicted: Callable[[Setting], ndarray]  # prediction in a setting, shape (N,)
 
 
 def direct_samples(
@@ -65,9 +63,9 @@ def direct_samples(
     cuts: Sequence[Cut],
     setting: Setting,
 ) -> dict[int, list[DirectSamples]]:
-    """Return all that the logs hold of windows that count, by the windows' numbers.
+    """Return the direct measurements of retained windows, by index of the window.
 
-    ``flights``: the logs as the replay takes them; ``setting``: the diagnosed one."""
+    ``flights``: the logs as prepared for the replay; ``setting``: the diagnosed one."""
     counting = [(w, c) for w, c in enumerate(cuts) if c.retained]
     last = {c.flight: w for w, c in counting}
     by_window = defaultdict(list)
@@ -83,13 +81,13 @@ def direct_samples(
 
 
 def needs_no_flight(e: SettingEffect) -> bool:
-    """Whether nothing but direct measurements shows an effect."""
+    """Return whether only direct measurements show an effect."""
     return bool(e.changes) and all(key.path.startswith(ACTS_ON) for key in e.changes)
 
 
 def has_camera_keypoints(log: FlightLog) -> bool:
-    """Whether a log holds keypoints that a camera saw: those that a policy's pilot projected from
-    poses say nothing about it.
+    """Return whether a log holds keypoints detected in images, rather than projected from poses by
+    a policy's pilot.
     """
     config = log.meta.get("config")
     source = config.get("keypoints", "") if isinstance(config, dict) else ""
@@ -104,13 +102,13 @@ def with_direct(
     settings: Sequence[Setting],
     steps: ndarray,
 ) -> Window:
-    """A window with its direct measurements behind the simulated samples.
+    """Append direct measurements to the simulated samples of a window.
 
     Args:
         window: with a column for every effect.
         listed: its direct measurements.
-        settings: the one that is linearised about, then one for each effect, a step away.
-        steps: of the effects, 0 for those without a derivative here, shape (K,).
+        settings: the setting of the linearisation, then one for each effect, a step away.
+        steps: finite differences of the effects, 0 for those without a derivative, shape (K,).
     """
     nominal, *perturbed = settings
     for direct in listed:
@@ -136,16 +134,14 @@ def with_direct(
 
 
 def _predict_alike(a: Setting, b: Setting) -> bool:
-    """Whether direct measurements are the same in two settings; the poses are measured ones."""
+    """Return whether direct measurements are predicted alike in two settings."""
     height = a.plant.release.landing_height
     other_height = b.plant.release.landing_height
     return (a.sensing, a.camera, height) == (b.sensing, b.camera, other_height)
 
 
 def _landing(time: float, point_w: ndarray) -> DirectSamples:
-    """Return the height at which the payload's centre was when it came down [m]: one sample of a
-    throw.
-    """
+    """Return the height of the payload's centre at its landing [m], as one sample."""
 
     def predicted(setting: Setting) -> ndarray:
         x = setting.sensing
@@ -168,7 +164,7 @@ def _camera_view(
     time, points, valid = view["time"], view["points"], view["valid"]
 
     def predicted(setting: Setting) -> ndarray:
-        """Return the keypoints' prediction; NaN where the lens is none."""
+        """Return the predicted keypoints; NaN if the setting's lens is invalid."""
         x = setting.sensing
         try:
             lens = nominal.camera
@@ -190,7 +186,7 @@ def _camera_view(
 
 
 def _reach(camera) -> ndarray:
-    """Pixels of 1 in normalised coordinates along x and y."""
+    """Return the pixels per normalised unit along x and y."""
     from camera.fisheye import Fisheye
 
     lens = camera.fisheye
@@ -198,8 +194,8 @@ def _reach(camera) -> ndarray:
 
 
 def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> dict | None:
-    """Views of one window: stamps, points, what is valid of them, goal, and splines through poses
-    that are smoothed on a grid about them.
+    """Collect the keypoints of one window: stamps, points, their validity, the goal, and splines
+    through smoothed poses.
     """
     time, points = measured(log, KEYPOINTS)
     first, last = flight.payload.time[[0, -1]]
@@ -222,7 +218,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         ("attitude", flight.attitude, x.vehicle_delay),
         ("payload", flight.payload, x.payload_delay),
     ):
-        stamped = replace(track, time=track.time - delay)  # at the times that they show
+        stamped = replace(track, time=track.time - delay)  # times of measurement
         fits = [smoothed(stamped, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
         if any(fit is None for fit in fits):
             return None
@@ -243,9 +239,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
 
 
 def _noise(points: ndarray, visible: ndarray) -> float:
-    """Estimate the noise of coordinates while they are seen: what stands in the log elsewhere is
-    none.
-    """
+    """Estimate the noise of coordinates from valid samples alone."""
     sigmas = []
     for k, i in zip(*np.nonzero(MEASURED)):
         track = points[visible[:, k, i], k, i]
@@ -255,8 +249,8 @@ def _noise(points: ndarray, visible: ndarray) -> float:
 
 
 def _visible_keypoints(view: dict, setting: Setting, nominal: Setting, time: ndarray) -> ndarray:
-    """Keypoints that the setting's camera sees at times, in the nominal lens's normalised
-    coordinates, shape (T, 8, 2).
+    """Project the keypoints at some times by the setting's camera, in normalised coordinates of the
+    nominal lens, shape (T, 8, 2).
     """
     import torch
 
@@ -266,13 +260,13 @@ def _visible_keypoints(view: dict, setting: Setting, nominal: Setting, time: nda
     camera = setting.camera
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
     turned = without_marker(x, view["attitude"](vehicle))
-    # The mount is stated from the centre of mass as it was believed: where the weight really lies
-    # moves no lens.
+    # The mount is stated relative to the nominal centre of mass: an error of that centre does not
+    # move the lens.
     off = np.subtract(x.marker_offset, nominal.plant.vehicle.body.com)
     pos = without_frame(x, view["vehicle"](vehicle)) - turned.apply(off)
     payload = time + (x.payload_delay - nominal.sensing.payload_delay)
     ball = without_frame(x, view["payload"](payload)) - x.payload_offset
-    # Smooth past the edge too: what was seen counts also where this predicts it out of view.
+    # Predict beyond the image's edge too: a point may be visible although it is predicted outside.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)
     goals = np.tile(view["goal"], (len(time), 1))

@@ -1,9 +1,8 @@
-"""Initial states of replay windows fitted to their samples by Levenberg and Marquardt, all windows
-at once.
+"""Fit the initial states of all replay windows to their samples at once, by Levenberg-Marquardt.
 
-A simulation of every direction costs some thirty times one of the state itself. So derivatives are
-used for several steps, as long as each brings what it promised, and may come from another setting
-whose states were fitted before."""
+Derivatives by all directions cost some thirty times as much as one simulation of a state. So they
+are used for several steps, as long as the cost falls about as predicted, and may come from an
+earlier fit in another setting."""
 
 from collections.abc import Mapping, Sequence
 
@@ -25,53 +24,48 @@ from visthrow.diagnose.throw.initial_states import (
 )
 from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation, carried
 
-DAMPING, DAMPING_MOST = (
-    1e-3,
-    1e5,
-)  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
+DAMPING = 1e-3  # of the first Levenberg-Marquardt step
+DAMPING_MOST = 1e5  # at which the fit of a window ends
 ROUNDS = 25
 DRIFT = 0.02, 0.02, 0.02, 0.04
-"""Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m],
-rate [rad/s]. Fitted as though there were none, states took their place: bends of the rope of ten
-times their prior, after twenty steps.
+"""Standard deviation that gusts cause within a second: position [m], attitude [rad], payload [m],
+rate [rad/s]. Without it, initial states would be fitted to the gusts: after twenty steps bends of
+the rope reached ten times their prior.
 """
-CALMER = tuple(0.5**k for k in range(1, 11))  # of that, which windows may turn out to have had
-GROWTH = (
-    1.5,
-    1.0,
-    1.5,
-    0.5,
-)  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
-HUBER = 30.0  # deviations, beyond which a sample counts less
-# deviations, beyond which no step leads back: a simulation that ran away
-FARTHEST = 1e9
-SETTLED = 1.0, 0.01  # fall of the cost, and relative one, below which an initial state is settled
-TRUE = 0.5  # of what it promised, which a step must bring for derivatives to be used further
-ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
-EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
-FITTED_SPAN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
+CALMER = tuple(0.5**k for k in range(1, 11))  # factors on the drift that are tried
+GROWTH = 1.5, 1.0, 1.5, 0.5
+"""Powers of time with which the drift grows. Forces act as white noise; attitude and rate are
+controlled.
+"""
+HUBER = 30.0  # deviations from which a sample loses weight
+FARTHEST = 1e9  # deviations above which a simulation has diverged
+SETTLED = 1.0, 0.01  # absolute and relative decrease of the cost below which a fit ends
+TRUE = 0.5  # share of the predicted decrease above which derivatives are used again
+ONWARD = 0.1  # simulated after the last sample that depends on the start: sensors may be early [s]
+EARLIER = 0.05  # by which the payload may separate before the expected time [s]
+FITTED_SPAN = 0.25  # shortest fit before the separation; else the whole window is fitted [s]
 TRUSTED = ("motor_speed",)
-"""Fields that are linearised about where the commands left them.
+"""Fields that are not fitted here: they keep the values that the commands lead to.
 
-Fitted without gusts they would take the gusts' place: rotors far from their commands at the start
-of a window, and with them a law of the thrust's slope that is none.
+Otherwise rotor speeds far from their commands would explain gusts at the start of a window, and
+cause a spurious law of the thrust's slope.
 """
 
 
 class _WindowFit:
-    """The fit of one window's state: what was flown last, and how bold its next step is.
+    """The fit of one window's initial state: its last simulation, derivatives and damping.
 
     Attributes:
         free: directions that are fitted. sd: their prior deviations.
         sensitive: see :func:`sensitive_samples`.
-        spread: deviation of the samples from a flight without gusts: noise, and how far gusts may
-            have led by then.
-        slopes: of the samples by the free directions, where they were taken last.
-        aged: whether they come from elsewhere. stale: whether new ones are due.
+        spread: deviation of the samples from a flight without gusts, by noise and by the drift that
+            gusts cause.
+        slopes: derivatives of the samples by the free directions, as taken last.
+        aged: whether they were taken at another state. stale: whether new ones are due.
     """
 
     def __init__(self, flights: ReplayedFlights, w: int, directions: Sequence[Direction]):
-        """Make ready; see :class:`InitialFit`."""
+        """Prepare the fit of window ``w``."""
         sd = deviations(directions, [flights.cuts[w]])[0]
         self.number = w
         self.free = [d for d, x in enumerate(directions) if sd[d] and x.field not in TRUSTED]
@@ -79,7 +73,7 @@ class _WindowFit:
         self.sigma = flights.sigma[w]
         self.drift = drift(flights, w)
         self.sensitive, self.end = sensitive_samples(flights, w)
-        self.gusts = 1.0  # against the drift that is thought possible
+        self.gusts = 1.0  # factor on the drift
         self.spread = np.hypot(self.sigma, self.drift)
         self.slopes: ndarray | None = None
         self.aged = False
@@ -87,7 +81,7 @@ class _WindowFit:
         self.damping = DAMPING
 
     def begin(self, residual: ndarray, slopes: ndarray | None) -> None:
-        """Start from a residual, with slopes of another fit if there are any."""
+        """Start from a residual, and from the slopes of another fit if given."""
         self.residual = residual
         self.cost = self.cost_of(residual)
         if slopes is not None:
@@ -96,7 +90,7 @@ class _WindowFit:
             self.stale = False
 
     def cost_of(self, residual: ndarray) -> float:
-        """Huber's cost of a residual; infinite where it leads nowhere."""
+        """Return Huber's cost of a residual; infinite if the simulation diverged."""
         off = np.abs(residual) / self.spread
         if not np.all(off < FARTHEST):
             return np.inf
@@ -104,10 +98,10 @@ class _WindowFit:
         return float(np.sum(clipped * (off - 0.5 * clipped)))
 
     def increment(self, done: ndarray) -> tuple[ndarray, float]:
-        """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the
-        cost that it promises.
+        """Return the Levenberg-Marquardt step with the vague prior, shape (directions,), and the
+        decrease of the cost that it predicts.
 
-        ``done``: how far the state has been moved, shape (directions,)."""
+        ``done``: displacement of the state so far, shape (directions,)."""
         scaled = self.slopes * self.sd / self.spread[:, None]
         if not np.all(np.abs(scaled) < FARTHEST):
             return np.zeros(len(done)), 0.0
@@ -123,7 +117,7 @@ class _WindowFit:
         return out, step @ slope - 0.5 * step @ bend @ step
 
     def judge(self, residual: ndarray, promised: float) -> bool:
-        """Take a step if it helps; returns whether it did."""
+        """Accept a step if the cost falls; return whether it was accepted."""
         cost = self.cost_of(residual)
         better = cost < self.cost
         fall = self.cost - cost if better else 0.0
@@ -148,11 +142,11 @@ class _WindowFit:
 
     @property
     def goes_on(self) -> bool:
-        """Whether another step may help."""
+        """Return whether another step may lower the cost."""
         return not self.settled and self.damping < DAMPING_MOST
 
     def _lower_gusts(self) -> bool:
-        """Take gusts for as strong as what is left says, if that is much less than was thought."""
+        """Lower the assumed drift to what the residual shows; return whether it was lowered."""
         samples = np.count_nonzero(self.sensitive)
         before = self.gusts
         for gusts in CALMER:
@@ -164,10 +158,10 @@ class _WindowFit:
 
 
 class InitialFit:
-    """Fits the states of the windows that count in one setting."""
+    """Fits the initial states of retained windows in one setting."""
 
     def __init__(self, flights: ReplayedFlights, simulation: Simulation):
-        """Make ready; ``simulation``: of the setting."""
+        """Prepare the fit; ``simulation``: of the setting."""
         self.flights = flights
         self.simulation = simulation
         self.directions = directions(simulation.settings[0].plant)
@@ -177,21 +171,19 @@ class InitialFit:
 
     @property
     def slopes(self) -> dict[int, ndarray]:
-        """Return the derivatives of windows' samples by their states, where they were taken
-        last.
-        """
+        """Return the derivatives of windows' samples by their initial states, as taken last."""
         return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
     def settled(self, slopes: Mapping[int, ndarray]) -> States:
-        """States fitted from those that flights through the windows give; see :meth:`fit`."""
+        """Fit states, starting from those of a simulation through the windows; see :meth:`fit`."""
         states, _ = carried(self.flights, self.simulation)
         return self.fit(states, slopes)
 
     def fit(self, states: States, slopes: Mapping[int, ndarray]) -> States:
-        """Fit each window's initial state to its samples; no step that does not help is taken.
+        """Fit each window's initial state to its samples.
 
-        ``states``: to begin with; ``slopes``: of windows' samples by their states, as
-        :attr:`slopes` of another fit has them, as far as they are known."""
+        ``states``: where the fit starts; ``slopes``: derivatives of windows' samples by their
+        states, from the :attr:`slopes` of another fit, for the windows that have any."""
         remaining = [fit for fit in self._fits if self.flights.cuts[fit.number].retained]
         states = {name: value.copy() for name, value in states.items()}
         flown = self._residuals(rows_of(states, _numbers(remaining)), remaining)
@@ -214,8 +206,8 @@ class InitialFit:
         return states
 
     def _residuals(self, states: States, fits: Sequence[_WindowFit]) -> list[ndarray]:
-        """Residuals of windows, of what depends on their initial states; a row of the states for
-        each.
+        """Simulate windows, one from each row of the states; return the residuals of the samples
+        that depend on their initial states.
         """
         lanes = [Lane(fit.number, 0, row) for row, fit in enumerate(fits)]
         residuals = self.flights.residuals(self.simulation, states, lanes, self._shortened)
@@ -243,7 +235,7 @@ def _numbers(fits: Sequence[_WindowFit]) -> ndarray:
 
 
 def drift(flights: ReplayedFlights, w: int) -> ndarray:
-    """Return how far gusts may have moved a window's samples by their time, as a deviation, shape
+    """Return the standard deviation by which gusts may have moved a window's samples, shape
     (N,).
     """
     since = np.maximum(flights.time[w] - flights.cuts[w].start, 0.0)
@@ -251,10 +243,11 @@ def drift(flights: ReplayedFlights, w: int) -> ndarray:
 
 
 def sensitive_samples(flights: ReplayedFlights, w: int) -> tuple[ndarray, float]:
-    """Which samples tell of a window's start, and how long it is flown for their sake [s].
+    """Return which samples depend on a window's initial state alone, and until when it is simulated
+    for them [s].
 
-    They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
-    few are left."""
+    The weights are 1 until the payload may separate and 0 later, as later samples depend on the
+    release. If too few samples remain, all weights are 1."""
     c = flights.cuts[w]
     time = flights.time[w]
     time_left = flights.separation(w) - EARLIER
@@ -270,12 +263,12 @@ def following(
     free: ndarray,
     change: ndarray,
 ) -> ndarray:
-    """Return how a window's initial state follows a change of the effects, so that the flight stays
-    as near to where it was as it can, in the state's units, shape (D,).
+    """Return the change of a window's initial state that compensates a change of the effects as far
+    as possible, in the state's units, shape (D,).
 
-    ``free``: which parts of the state follow, shape (D,), bool; ``change``: of the effects' sizes,
-    shape (K,)."""
-    samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
+    ``free``: which parts of the state may change, shape (D,), bool; ``change``: of the effects'
+    sizes, shape (K,)."""
+    samples = len(flights.time[w])  # those of a camera come after them and do not depend on states
     sensitive = sensitive_samples(flights, w)[0]
     weight = sensitive / np.hypot(flights.sigma[w], drift(flights, w))
     sd = window.nuisance_sd[free]
@@ -289,7 +282,7 @@ def following(
 
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
-    """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
+    """Return the states followed by those perturbed along each direction: row ``(1 + d) W + w``."""
     rows = np.arange(len(states["pos_w"]))
     steps = np.diag([d.step for d in directions]).repeat(len(rows), axis=0)
     moved = moved_along(rows_of(states, np.tile(rows, len(directions))), directions, steps)

@@ -1,5 +1,5 @@
-"""Initial states of replay windows: from smoothed measurements, and the directions in which they
-are not known.
+"""Initial states of replay windows: first guesses from smoothed measurements, and the directions
+in which they are uncertain.
 """
 
 from collections.abc import Sequence
@@ -17,28 +17,30 @@ from visthrow.common.rotations import cross, normal_part
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
-SMOOTH_BEFORE = 0.06  # a window's start, from which measurements are smoothed [s]
-SMOOTH_AFTER = 0.08  # a window's start, up to which they are [s]
+# measurements from this long before a window's start to this long after it are smoothed [s]
+SMOOTH_BEFORE = 0.06
+SMOOTH_AFTER = 0.08
 LEAST_SAMPLES = 6
-MODES = 4  # half waves of a bent rope
+MODES = 4  # highest mode of the rope's bending, in half waves
 INTEGRAL = 1.0
-"""Deviation of the rate error's integral [rad]: with a third of it the integrators of 80 windows
-pull a centre of mass that lies 1.4 mm off by a quarter towards the frame's origin.
+"""Prior deviation of the rate error's integral [rad]. With a third of it, the estimate of a centre
+of mass that is 1.4 mm off came out a quarter too small over 80 windows.
 """
 
 BENT = (0.03, 0.5)
 SHAKEN = (0.1, 1.5)
-"""Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and
-where it has just come taut.
+"""Prior deviation of a bend of the rope [rad] and of its rate [rad/s], for a rope that stayed taut
+and for one that has just become taut.
 
-Ropes that fly through the windows before a window arrive there with bends of some 0.005 rad, of
-0.03 rad at most. A wider prior lets a rope that is too long for what was measured bend until it is
-short enough; what it does then is whip."""
+Ropes simulated through the preceding windows reach a window with bends of some 0.005 rad, at most
+0.03 rad. With a wider prior, a rope that is too long could bend to fit the measured distance; the
+bend would then whip."""
 HUNG = 0.1
-"""Of that, where the rope hung still before: there ropes arrive with bends of 0.0005 rad.
+"""Factor on the deviations of a taut rope where it hung still before: such ropes reach a window
+with bends of 0.0005 rad.
 
-A wider prior invents bends of 0.02 rad out of noise; they whip, and tell of the rope's and the
-payload's mass what is not so.
+With a wider prior, noise is fitted by bends of 0.02 rad. They whip, which biases the masses of rope
+and payload.
 """
 
 RIGID = (
@@ -47,45 +49,45 @@ RIGID = (
     ("vel_w", 1.0, 1e-3),
     ("rate_b", 3.0, 1e-3),
 )
-"""Fields of a body with their vague priors and the steps of their derivatives."""
+"""Fields of a body's state with the deviations of their vague priors and the steps of their
+derivatives.
+"""
 
 ROPE = ("cable_dir_w", "cable_vel_w")
 
 States = dict[str, ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
 MOVED = "moved"
-"""Beside the fields: how far a fit moved each state along the directions from where their prior has
-its middle, shape (S, directions).
+"""Key for the displacement of each state from the mean of its prior along the directions, shape
+(S, directions).
 """
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A way in which an initial state may be wrong."""
+    """A direction of the state space in which an initial state is uncertain."""
 
     field: str
     axis: int
     sd: float  # vague prior, in the field's unit (attitude: angle [rad])
     step: float  # for the derivative
     part: str | int = ""  # of the rope: "all" segments, the "last", or the half waves of a bend
-    calm: float | None = (
-        None  # the prior in windows whose rope was taut all the time, where it is another
-    )
+    calm: float | None = None  # prior where the rope was taut all the time, if it differs
 
     @property
     def place(self) -> tuple[str, int, str | int]:
-        """Return where it leads, whatever its size."""
+        """Return an identifier of the direction that does not depend on its prior."""
         return self.field, self.axis, self.part
 
     @property
     def follows(self) -> bool:
-        """Whether it goes with the effects: a bend of the rope does not, which would take the place
-        of a wrong length.
+        """Return whether the state is adjusted in this direction when the effects change. Bends of
+        the rope are not: they would absorb a wrong length.
         """
         return not self.field.startswith("cable") or self.part == "all"
 
     def deviation(self, c: Cut) -> float:
-        """Return its prior's deviation in a window; 0 where its state does not have it: higher
-        bends has only a rope that has just come taut.
+        """Return the prior deviation in a window; 0 if the direction does not exist there. Only a
+        rope that has just become taut has higher bends.
         """
         if self.field.startswith("cable"):
             low = self.part in ("all", "last", 1)
@@ -98,14 +100,16 @@ class Direction:
 
 
 def deviations(directions: Sequence[Direction], cuts: Sequence[Cut]) -> ndarray:
-    """Return what is not known of windows' initial states, shape (W, directions); 0 where a state
-    does not have a direction.
+    """Return the prior deviations of windows' initial states, shape (W, directions); 0 where a
+    direction does not exist.
     """
     return np.array([[direction.deviation(c) for direction in directions] for c in cuts])
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
-    """Directions, vague in whatever a sensing effect can move."""
+    """List the directions. Their priors are vague where an error of a sensor can shift the
+    state.
+    """
     controller = plant.vehicle.controller
     listed = [Direction(field, i, sd, step) for field, sd, step in RIGID for i in range(3)]
     if controller.kind != "geometric":
@@ -124,7 +128,7 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
 
 
 def _tangents(n: ndarray) -> ndarray:
-    """Two unit vectors normal to each direction, shape (..., 2, 3)."""
+    """Return two unit vectors normal to each direction, shape (..., 2, 3)."""
     x_axis, y_axis, _ = np.eye(3)
     axis = np.where(np.abs(n[..., :1]) < 0.7, x_axis, y_axis)
     first = np.cross(n, axis)
@@ -133,8 +137,8 @@ def _tangents(n: ndarray) -> ndarray:
 
 
 def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray) -> States:
-    """States moved further along all directions by ``sizes``, shape (S, directions); directions of
-    the rope before its rates.
+    """Move states along all directions by ``sizes``, shape (S, directions). Directions of the rope
+    must precede those of its rates.
     """
     out = {**states, MOVED: states[MOVED] + sizes}
     for field in dict.fromkeys(direction.field for direction in directions):
@@ -148,7 +152,7 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray)
             value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
         elif field.startswith("cable"):
             n = out["cable_dir_w"]
-            # one plane for the whole rope: that of its mean direction
+            # the whole rope uses the tangent plane of its last segment
             frame = _tangents(n[:, -1])[:, axes]
             shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in members])
             displacement = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
@@ -173,20 +177,20 @@ def _shape(part: str | int, segments: int) -> ndarray:
 
 
 def rows_of(states: States, rows: ndarray) -> States:
-    """Some of the states."""
+    """Return some of the states."""
     return {name: value[rows] for name, value in states.items()}
 
 
 def stacked(parts: list[States]) -> States:
-    """States one after the other."""
+    """Concatenate states."""
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
 
 def smoothed(
     samples: ChannelSamples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[ndarray, ndarray] | None:
-    """Value and derivative at a time from a local cubic through the samples about it; None without
-    enough of them.
+    """Fit a local polynomial to the samples about a time; return its value and derivative there,
+    None if there are too few samples.
     """
     for reach in (1.0, 2.0, 4.0):
         chosen = samples.during(time - reach * before, time + reach * after)
@@ -201,7 +205,7 @@ def smoothed(
 
 
 def _smooth_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
-    """Attitude at time 0 (xyzw) and the body rate there [rad/s]."""
+    """Return the attitude at time 0 (xyzw) and the body rate there [rad/s]."""
     middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
     turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()
     fit = np.polynomial.polynomial.polyfit(time, turn, 2 if len(time) < 12 else 3)
@@ -209,12 +213,12 @@ def _smooth_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
 
 
 def without_frame(x: SensingParams, vectors: ndarray) -> ndarray:
-    """Return measured points [m] or velocities [m/s], shape (..., 3), in the world's frame."""
+    """Transform measured points [m] or velocities [m/s], shape (..., 3), into the world's frame."""
     return Rotation.from_rotvec(x.frame_tilt).inv().apply(vectors) / (1.0 + x.scale)
 
 
 def without_marker(x: SensingParams, measured: Rotation) -> Rotation:
-    """Return the vehicle's attitude in the world's frame from that measured of its marker body."""
+    """Convert the measured attitude of the marker body into the vehicle's, in the world's frame."""
     frame = Rotation.from_rotvec(x.frame_tilt)
     return frame.inv() * measured * Rotation.from_rotvec(x.marker_rotation).inv()
 
@@ -222,10 +226,10 @@ def without_marker(x: SensingParams, measured: Rotation) -> Rotation:
 def measured_state(
     flight: RecordedFlight, time: float, setting: Setting, payload: int, inner: States
 ) -> States:
-    """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one
-    state).
+    """Return the state at a time of a flight: measured fields from smoothed samples, all others
+    from ``inner`` (one state).
 
-    The measurements are taken back through the setting's delays, frame and markers.
+    The setting's delays, frame and marker offsets are removed from the measurements.
     """
     out = {name: value.copy() for name, value in inner.items()}
     x = setting.sensing
@@ -258,8 +262,8 @@ def measured_state(
 def _hang(
     state: States, plant: PlantParams, attitude: Rotation, point: ndarray, speed: ndarray
 ) -> None:
-    """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and
-    follows both.
+    """Turn the rope as a rigid shape so that it points from the mount to the payload, and give it
+    the angular rate of that line.
     """
     arm = np.subtract(plant.rope.mount, plant.vehicle.body.com)
     mount = state["pos_w"][0] + attitude.apply(arm)
@@ -282,7 +286,9 @@ def _hang(
 
 
 def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
-    """A state in hover at the flight's start: what the first window's measurements do not tell."""
+    """Return a hover state at the flight's start, for the fields that the first window's samples do
+    not measure.
+    """
     v = plant.vehicle
     battery = v.battery
     rope = plant.rope
@@ -307,16 +313,17 @@ def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
 
 
 def _power(v: VehicleParams, thrust: float) -> float:
-    """Power drawn from the battery under a steady collective thrust [N]: [W]."""
+    """Return the power drawn from the battery [W] at a steady collective thrust [N]."""
     speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
     return v.battery.idle_power + thrust * speed * v.thrust.torque_ratio / v.battery.efficiency
 
 
 def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
-    """Fraction of the charge used at the start, from the first voltage and the power [W] drawn
-    then. Where none was logged: from that of the hover in which throttle was calibrated, where the
-    controller makes up for no other; else a fifth.
-    """
+    """Return the fraction of the charge that is used at the start.
+
+    It follows from the first logged voltage and the power [W] drawn then. Without a logged voltage,
+    a controller that does not compensate voltage is assumed to start at the voltage of the hover in
+    which its throttle was calibrated; otherwise a fifth is assumed."""
     cell = v.battery
     c = v.controller
     volts = flight.voltage

@@ -1,10 +1,9 @@
-"""Where throws come down: simulated open loop from before the throw, against where the payload was
-seen to land.
+"""Predict where payloads land, and compare with the measured landings.
 
-A second before the separation the initial state is fitted to 0.4 s of measurements; from there on
-nothing but the recorded commands is used, so that the landing is predicted through the throw, the
-release and the ballistic flight. Beside it stands the prediction from a state that is fitted up to
-the separation: what is then left comes from release and flight alone."""
+Two open-loop predictions are made. The first begins a second before the separation: its initial
+state is fitted to 0.4 s of measurements, and only recorded commands are used from then on, through
+throw, release and ballistic flight. The second begins with a state that is fitted up to the
+separation: its error comes from release and ballistic flight alone."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -26,43 +25,38 @@ from visthrow.diagnose.throw.cutting import (
 from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
 from visthrow.diagnose.throw.replay import Lane, ReplayedFlights
 
-LEAD = 1.0  # before the separation, at which the open loop begins [s]
-HEAD = 0.4  # of it, over which the initial state is fitted [s]
-TRACK = 0.1  # of the payload's track just above the ground, from which a landing is taken [s]
-LEAST_TRACK = 6  # samples of it
+LEAD = 1.0  # time from the begin of the first prediction to the separation [s]
+HEAD = 0.4  # its beginning, over which the initial state is fitted [s]
+TRACK = 0.1  # length of the track just above the ground from which a landing is extrapolated [s]
+LEAST_TRACK = 6  # fewest samples of that track
 AFTERWARDS = 0.4  # simulated beyond the measured landing [s]
-TICK = 5e-3  # between the points of a simulated path [s]; a chord is 0.03 mm off the parabola
+TICK = 5e-3  # time between points of a simulated path [s]; a chord deviates 0.03 mm from a parabola
 
 
 @dataclass(frozen=True)
 class PredictedLandings:
-    """Throws whose landing was measured; points [m] on the plane of the landing, in the measured
-    frame.
+    """Measured and predicted landings of F throws; points [m] on the landing plane, in the frame of
+    the measurements.
     """
 
-    flights: ndarray  # their numbers, shape (F,)
+    flights: ndarray  # indices of the flights, shape (F,)
     measured: ndarray  # shape (F, 3)
-    # open loop from before the throw, shape (F, 3); NaN where it never comes down
-    predicted: ndarray
+    predicted: ndarray  # from before the throw, shape (F, 3); NaN if the payload never lands
     released: ndarray  # from a state fitted up to the separation, shape (F, 3)
 
     @property
     def errors(self) -> ndarray:
-        """Horizontal distance of the open-loop prediction from the measured landing [m], shape
-        (F,).
-        """
+        """Return the horizontal distances of predicted from measured landings [m], shape (F,)."""
         return norm(self.off, axis=1)
 
     @property
     def released_errors(self) -> ndarray:
-        """Return the errors of the prediction from the separation [m], shape (F,)."""
+        """Return the same distances for the prediction from the separation [m], shape (F,)."""
         return norm((self.released - self.measured)[:, :2], axis=1)
 
     @property
     def off(self) -> ndarray:
-        """Return the open-loop prediction less the measured landing along world x and y [m], shape
-        (F, 2).
-        """
+        """Return predicted minus measured landings along world x and y [m], shape (F, 2)."""
         return (self.predicted - self.measured)[:, :2]
 
     @classmethod
@@ -73,10 +67,10 @@ class PredictedLandings:
 
 
 def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndarray] | None:
-    """Time [s] and point [m] at which a payload came down; None where nobody saw it.
+    """Return time [s] and point [m] of a payload's landing; None if it cannot be determined.
 
-    Without a logged landing the track just above the ground is carried on to ``height`` by a
-    parabola."""
+    If the log holds no landing, a parabola extrapolates the track just above the ground to
+    ``height``."""
     if flight.latch == NEVER:
         return None
     if flight.landing_point is not None:
@@ -106,8 +100,8 @@ def landings(
     """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel`
     with effects at ``theta``.
 
-    ``theta``: sizes of effects in their units; those not named at 0; ``flights``: numbers of
-    flights to look at; default all. None where no landing was measured."""
+    ``theta``: sizes of effects in their units, 0 by default; ``flights``: indices of flights,
+    default all. Returns None if no landing was measured."""
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights
     before, separating, ends, points = {}, {}, {}, {}
@@ -127,8 +121,8 @@ def landings(
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Return where a throw's state is fitted [s]: before the open loop, and up to the separation;
-    both outside of a slack rope.
+    """Return the two spans over which a throw's state is fitted [s]: before the throw, and up to
+    the separation; the rope is taut in both. None if one is too short.
     """
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
@@ -151,8 +145,8 @@ def _fly(
     spans: Mapping[int, tuple[float, float]],
     ends: Mapping[int, float],
 ) -> ndarray:
-    """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``,
-    shape (F, 3).
+    """Fit the states of throws over ``spans``, simulate them to ``ends``, and return the landing
+    points, shape (F, 3).
     """
     cuts: list[Cut] = []
     for n, (begin, end) in spans.items():
@@ -176,8 +170,8 @@ def _fly(
 
 
 def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
-    """A flight's windows before ``begin``, only flown through, and the one that its state is fitted
-    over.
+    """Return a flight's windows before ``begin``, which only carry the state on, and the window
+    over which its state is fitted.
     """
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
     cuts = [replace(c, end=min(c.end, begin), retained=False) for c in before]
@@ -185,7 +179,7 @@ def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
 
 
 def _extend_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
-    """The flight with stamps of a payload all the way down in place of the measured ones."""
+    """Replace the payload's samples by stamps that extend to ``end``."""
     if end is None:
         return flight
     time = np.arange(flight.latch, end + 1.0, TICK)
@@ -194,7 +188,9 @@ def _extend_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
 
 
 def _crossing(path: ndarray, height: float) -> ndarray:
-    """Return where a path, shape (T, 3), comes down through a height; NaN where it does not."""
+    """Return the point at which a path, shape (T, 3), falls through a height; NaN if it does
+    not.
+    """
     above = path[:, 2] > height
     down = np.flatnonzero(above[:-1] & ~above[1:])
     if not len(down):

@@ -1,8 +1,7 @@
-"""Derivatives of windows' samples by effects, initial states and latent forces: which lanes are
-flown, and what comes of them.
+"""Linearise windows: derivatives of their samples by effects, initial states and latent forces.
 
-A derivative is a difference of two lanes of the same steps. Longer steps, with a nominal lane of
-their own, tell most of them as well; residuals always come from the nominal steps.
+A derivative is a finite difference of two lanes with the same step length. Most of them are taken
+with longer steps, against a nominal lane of that length. Residuals always use the nominal step.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,32 +26,32 @@ from visthrow.diagnose.throw.replay import (
 )
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
-"""Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N].
+"""Finite differences of the latent forces: force [N], torque [N m], force on the payload [N].
 
-Small, for a steady torque is controlled away and leaves nothing in a window: with a hundred times
-as much its second order was left, alike for all axes.
+They are small because the controller cancels a steady torque, so its first-order effect is small.
+With a hundred times as much, only the second-order effect remained, equal for all axes.
 """
 EXACT = ("plant.vehicle.controller.gyro_time_constant", "plant.rope.payload_inertia", "step_square")
-"""Numbers by which derivatives take the nominal steps: with twice as long ones they differ by more
-than a fifth. Where a rope has just come taut, those by all effects and states do.
+"""Parameters whose derivatives use the nominal steps: with twice as long ones they differ by more
+than a fifth. The same holds for all derivatives of a rope that has just become taut.
 """
 
 CALM_SPEED = 0.1
-"""Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the
-air's own doing: rooms have draughts of that speed, and a gust brings a hovering vehicle a velocity
-that goes with it, as if drag were negative.
-"""
-AERODYNAMIC = "aerodynamics"  # block whose effects go with that velocity
+"""Root mean square speed of a window [m/s] up to which the air may move as fast as the vehicle.
+
+Rooms have draughts of that speed. A gust pushes a hovering vehicle along, which looks like negative
+drag."""
+AERODYNAMIC = "aerodynamics"  # block whose effects depend on that speed
 
 
 def exact(e: SettingEffect) -> bool:
-    """Whether an effect's derivative needs the nominal steps in every window."""
+    """Return whether an effect's derivative needs the nominal steps in every window."""
     return any(key.path in EXACT for key in e.changes)
 
 
 def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
-    """A window in which vehicle and air hardly move against each other, without what speeds would
-    tell there; others as they are.
+    """Remove the dependence on speeds from a window in which vehicle and air hardly move relative
+    to each other; return other windows unchanged.
 
     ``window``: with all columns; ``wind_w``: of the setting [m/s].
     """
@@ -75,16 +74,16 @@ def _typical_speed(vel: ndarray) -> float:
 class Plan:
     """The lanes of one window in a run.
 
-    Its columns are those of effects, of directions of the initial state, and of latent forces.
+    Its columns belong to effects, directions of the initial state, and latent forces.
     """
 
     window: int
     lanes: list[Lane]
-    first: int  # number of its first lane in the run
+    first: int  # index of its first lane in the run
     first_knot: int  # first row of the knots
-    place: ndarray  # lane of each column, behind the first one
-    nominal: ndarray  # lane of the same steps that it differs from, likewise
-    steps: ndarray  # of each column's derivative
+    place: ndarray  # lane of each column, relative to the first one
+    nominal: ndarray  # lane of the same steps to subtract, relative to the first one
+    steps: ndarray  # finite difference of each column
     states: ndarray  # directions of the initial state
     latents: ndarray  # axis and knot, shape (L, 2)
 
@@ -101,13 +100,12 @@ class Linearisation:
         directions: Sequence[Direction],
         states: States,
     ):
-        """Keep it.
+        """Store the settings and states of a linearisation.
 
         Args:
-            simulation: of the setting that is linearised about, then of one for each effect.
-            steps: of the effects, shape (K,).
-            states: initial ones, then those that are moved along each direction: row
-                ``(1 + d) W + w``.
+            simulation: the setting of the linearisation, then one for each effect. steps: finite
+            differences of the effects, shape (K,). states: initial states, then those perturbed
+            along each direction: row ``(1 + d) W + w``.
         """
         self._flights = flights
         self._simulation = simulation
@@ -125,7 +123,9 @@ class Linearisation:
         }
 
     def windows(self, batch: Sequence[int], channels: Sequence[ndarray]) -> list[Window]:
-        """Linearise windows whose lanes fit a run; ``channels``: of the samples of each."""
+        """Linearise windows whose lanes fit into one run; ``channels``: of each window's
+        samples.
+        """
         plans: list[Plan] = []
         lanes: list[Lane] = []
         first_knot = 0
@@ -143,10 +143,11 @@ class Linearisation:
         return parallel_map(window, plans, channels)
 
     def _plan(self, w: int, first: int, first_knot: int) -> Plan:
-        """Plan the lanes of one window: nominal, those that ride along; rough nominal, the others.
+        """Plan the lanes of one window, in this order: nominal, lanes with the same motion as the
+        nominal one, rough nominal, all others.
 
-        ``first``: number of the first; ``first_knot``: first row of the knots; twice as many as the
-        window's are taken."""
+        ``first``: index of the first lane; ``first_knot``: first row of the knots, of which the
+        plan takes twice the window's number."""
         c = self._flights.cuts[w]
         knots = int(self._flights.knots[w])
         alike = self._alike[self._flights.kind(w)]
@@ -179,7 +180,7 @@ class Linearisation:
         return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
     def _slopes(self, samples: ndarray, plan: Plan) -> ndarray:
-        """Derivatives of a window's samples by its columns, shape (N, columns).
+        """Return the derivatives of a window's samples by its columns, shape (N, columns).
 
         ``samples``: of all lanes of the run, shape (rows or more, lanes, 3).
         """
@@ -196,9 +197,9 @@ class Linearisation:
         slopes: ndarray,
         knots: Mapping[str, ndarray],
     ) -> Window:
-        """Return the window that the lanes make up; ``knots``: quantities at those of all lanes.
+        """Return the linearised window; ``knots``: quantities at the knots of all lanes.
 
-        Its residual is that of states in the middle of their prior."""
+        Its residual is extrapolated to the mean of the states' prior."""
         w = plan.window
         f = self._flights
         c = f.cuts[w]
@@ -231,7 +232,7 @@ class Linearisation:
 def at_knots(
     flights: ReplayedFlights, setting: Setting, w: int, knots: Mapping[str, ndarray]
 ) -> dict[str, ndarray]:
-    """Simulated quantities at the knots, those of the payload where there is one."""
+    """Return the simulated quantities at the knots, including those of an attached payload."""
     c = flights.cuts[w]
     time = np.minimum(c.start + KNOT_SPACING * np.arange(len(knots["thrust"])), c.end)
     flown = {name: value.copy() for name, value in knots.items()}

@@ -1,5 +1,5 @@
-"""What a replay needs of a flight log: commands, release, and what was measured of vehicle, payload
-and gyro.
+"""Extract from a flight log what a replay needs: commands, release, and the measurements of
+vehicle, payload and gyro.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from visthrow.logs.samples import Samples
 
 NEVER = 1e9  # a time after every flight [s]
 LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 1e-3}
-"""Noise below which no channel is believed: what numerics and rounding leave [m], [rad], [m],
+"""Smallest noise that is assumed, because of numerical errors and rounding [m], [rad], [m],
 [rad/s].
 """
 
-BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
-# samples of the gyro a second: faster ones tell a model of 500 steps a second no more
+BETWEEN = 0.05  # longest time between two attitudes over which they are interpolated [s]
+# sampling rate of the gyro [1/s]; at 500 steps a second, a faster one carries no more information
 SUFFICIENT_RATE = 250.0
-AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
+AT_START = 0.25  # beginning of a log, whose voltages give the charge used before [s]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class ChannelSamples:
 
     time: ndarray  # [s], shape (T,)
     values: ndarray  # shape (T, 3) or (T, 4)
-    sigma: float  # of one component; of an attitude the angle's [rad]
+    sigma: float  # noise of one component; for an attitude, of the angle [rad]
 
     def during(self, first: float, last: float) -> "ChannelSamples":
         """Return the samples with first <= time < last."""
@@ -45,7 +45,7 @@ NO_SAMPLES = ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
 
 @dataclass(frozen=True)
 class RecordedFlight:
-    """One flight."""
+    """The commands and measurements of one flight."""
 
     command_time: ndarray  # [s], shape (C,)
     command: ndarray  # [N, rad/s], shape (C, 4)
@@ -56,28 +56,24 @@ class RecordedFlight:
     payload: ChannelSamples | None
     gyro: ChannelSamples | None
     voltage: float | None  # at the start [V]
-    hanging: bool | None = (
-        None  # whether the log says that a payload hung below at its start; None where it does not
-    )
-    landing_point: ndarray | None = (
-        None  # where the log says that the payload came down [m], shape (3,)
-    )
+    hanging: bool | None = None  # whether a payload hung below at the start; None if not logged
+    landing_point: ndarray | None = None  # logged landing of the payload [m], shape (3,)
 
     @property
     def start(self) -> float:
-        """First time from which both commands and poses are known [s]."""
+        """Return the first time at which both commands and poses are known [s]."""
         return max(self.command_time[0], self.vehicle.time[0])
 
     @property
     def end(self) -> float:
-        """Last time that both reach [s]."""
+        """Return the last time at which both commands and poses are known [s]."""
         period = np.median(np.diff(self.command_time)) if len(self.command_time) > 1 else 0.02
         return min(self.command_time[-1] + period, self.vehicle.time[-1] + 1e-6)
 
 
 def measured(log: FlightLog, name: str) -> Samples | None:
-    """Return the valid samples of a channel as it was measured, where a log holds the truth beside
-    it; None without any.
+    """Return the valid samples of a channel, the measured ones if a log also holds the truth; None
+    if there are none.
     """
     return log.samples(f"measured_{name}", 1) or log.samples(name, 1)
 
@@ -88,7 +84,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
         return None
     time, values = samples
     fresh = np.ones(len(time), dtype=bool)
-    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
+    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is stale
     if np.count_nonzero(fresh) < 5:
         return None
     if not _is_rounded(values):
@@ -101,7 +97,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
         if len(time) < 5:
             return None
     noise = sensor_sigma(values)
-    # An angle moves three of four numbers of an attitude by its half.
+    # A rotation by a small angle changes three of a quaternion's four numbers by half of it.
     sigma = np.median(noise)
     if name == "quat_wb":
         sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0)
@@ -109,12 +105,12 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
 
 
 def _thin(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
-    """Thin samples that come at twice :data:`SUFFICIENT_RATE` or faster, shape (T,) and (T, N), out
-    to fewer that say as much: every n-th of them smoothed.
+    """Decimate samples that come at twice :data:`SUFFICIENT_RATE` or faster, shape (T,) and (T, N),
+    to every n-th one, smoothed.
 
-    A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as
-    white as it was: neighbours correlate by at most 0.07. Times are smoothed alike, so that single
-    samples may lack; none goes across a gap.
+    A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and keeps the noise nearly
+    white: neighbours correlate by at most 0.07. Times are smoothed in the same way, so single
+    samples may be missing. No parabola extends across a gap.
 
     Source: Savitzky and Golay 1964.
     """
@@ -137,10 +133,11 @@ def _thin(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
 
 
 def _is_rounded(values: ndarray) -> bool:
-    """Whether most changes of a channel, shape (T, N), are of the one step that it was recorded in.
+    """Return whether most changes of a channel, shape (T, N), equal the step to which it is
+    rounded.
 
-    Such samples repeat themselves without being stale. Without the repeated ones those would be
-    left at which a step was just taken: half a step ahead of what was measured."""
+    Samples of such a channel repeat without being stale. If the repeated ones were dropped, those
+    just after a step would remain, which are half a step ahead of the measured value."""
     changes = np.abs(np.diff(values, axis=0))
     changes = changes[changes > 0.0]
     smallest = np.min(changes, initial=np.inf)
@@ -148,7 +145,7 @@ def _is_rounded(values: ndarray) -> bool:
 
 
 def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
-    """Take from a log what a replay needs.
+    """Extract from a log what a replay needs.
 
     Raises DiagnoseError: no commands, or no poses of the vehicle.
     """
@@ -186,10 +183,10 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
 def _pair(
     pos: ChannelSamples, quat: ChannelSamples, number: int
 ) -> tuple[ChannelSamples, ChannelSamples]:
-    """Positions and attitudes of the same times: of common stamps, else attitudes between their
-    samples.
+    """Pair positions with attitudes of the same time: those of common stamps, else attitudes
+    interpolated at the stamps of the positions.
 
-    Raises DiagnoseError: neither has them.
+    Raises DiagnoseError: fewer than five pairs exist.
     """
     common, at_pos, at_quat = np.intersect1d(
         np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True
@@ -217,11 +214,10 @@ def _pair(
 
 
 def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
-    """Whether each flight carries a payload: as its log says, else if it was measured or released
-    there.
+    """Return whether each flight carries a payload.
 
-    Where no flight measured the payload, one release tells that it hung below in all.
-    """
+    The log may state it. Otherwise a flight carries one if its log measured or released a payload.
+    If no flight measured a payload, a release in one flight implies a payload in all."""
     measured_somewhere = any(f.payload is not None for f in flights)
     released_somewhere = any(f.latch != NEVER for f in flights)
     hanging = [
@@ -246,7 +242,7 @@ def _latch(log: FlightLog) -> float:
 
 
 def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
-    """Time and point of the payload's landing."""
+    """Return time and point of the payload's landing."""
     landing = measured(log, "landing")
     if landing is None:
         return NEVER, None
@@ -254,9 +250,7 @@ def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
 
 
 def _voltage(log: FlightLog) -> float | None:
-    """Terminal voltage at the start of a log: the median of the samples of its first moment, as
-    single ones are noisy.
-    """
+    """Return the terminal voltage at the start of a log: a median, as single samples are noisy."""
     voltage = measured(log, "battery_voltage")
     if voltage is None:
         return None

@@ -1,6 +1,7 @@
-"""Recorded flights cut into windows, ready to be replayed in any setting: the arrays that all lanes
-of a batch share.
-"""
+"""Replay windows of recorded flights in batches of lanes.
+
+A lane is one simulation of one window, with its own setting and initial state. All lanes share the
+arrays of recorded commands and stamps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,25 +32,22 @@ from visthrow.diagnose.throw.recorded_flight import (
 )
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
-EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
-LATEST = 1.0  # by which commands may be late or early [s]; a window reads no others
-# step in a phase against the one asked for, and against a rough one: the rope whips in throws
+EARLY = 0.004  # samples this soon after a window's start are not used: delays may shift them [s]
+LATEST = 1.0  # largest delay or lead of commands [s]; a window reads no others
+# factors on the nominal and on the rough step in a phase: the rope whips in throws
 FINENESS = {"throw": (0.25, 0.5)}
-FINEST = 0.01  # of the square of the step: a tenth of the step asked for
-# added to the square of the step, in the nominal one, of rough lanes: twice as long steps
+FINEST = 0.01  # smallest factor on the square of the step: a tenth of the requested step
+# added to that factor for rough lanes, whose steps are twice as long
 ROUGHER = 3.0
-# shortest lags of the vehicle's filters and rotors, above which a rough step may not go
+# longest rough step, in multiples of the shortest lag of the vehicle's filters and rotors
 STABLE = 1.75
-BATCH, CUDA_BATCH = (
-    4096,
-    32768,
-)  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
+# lanes of one run, which limits its memory; on a GPU, more lanes take hardly more time
+BATCH, CUDA_BATCH = 4096, 32768
 
 
 def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[list[int]]:
-    """Split windows into runs of at most so many lanes, or of one window.
-
-    ``lanes``: of each window.
+    """Split windows into runs of at most ``room`` lanes, or of one window; ``lanes``: number of
+    lanes of each window.
     """
     groups: list[list[int]] = []
     spare = 0
@@ -63,8 +61,8 @@ def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[lis
 
 
 def step_lengths(setting: Setting, substep: float) -> tuple[float, float]:
-    """Return the lengths of the nominal steps and of a rough lane's [s]: twice as long, as far as
-    the vehicle's shortest lag allows.
+    """Return the lengths of nominal and rough steps [s]. Rough ones are twice as long, unless the
+    vehicle's shortest lag forbids it.
     """
     controller = setting.plant.vehicle.controller
     motor = setting.plant.vehicle.motor
@@ -83,23 +81,21 @@ def step_lengths(setting: Setting, substep: float) -> tuple[float, float]:
 
 
 class Simulation:
-    """Plants and sensors that lanes are flown with.
+    """Plants and sensors for the lanes of a run.
 
     Attributes:
-        settings: a lane names its by the row.
+        settings: a lane refers to one of them by its index.
     """
 
     def __init__(self, settings: Sequence[Setting], substep: float, device: str):
-        """Move them to a device.
-
-        ``substep``: largest integration step [s]."""
+        """Copy the settings to a device; ``substep``: largest integration step [s]."""
         self.settings = list(settings)
         self.replay = Replay([s.plant for s in settings], [s.sensing for s in settings], device)
         self.steps = np.array([step_lengths(s, substep) for s in settings])
 
 
 class Lane(NamedTuple):
-    """The settings of one lane of a batch; there are some ten thousand in a run."""
+    """One simulation of one window; a run has some ten thousand lanes."""
 
     window: int
     plant: int  # row of the settings
@@ -108,20 +104,21 @@ class Lane(NamedTuple):
     knot: int = 0
     size: float = 0.0
     keep: int = -1
-    resume: int = -1  # row of what another lane keeps, at which this one leaves it
-    parent: int = -1  # that lane
-    shared: int = 0  # lanes after it that share its flight and differ in what sensors show of it
-    rough: bool = False  # whether it flies with longer steps
-    skip: int = -1  # command that does not come: the one before stays
+    resume: int = -1  # row of another lane's stored states at which this lane branches off
+    parent: int = -1  # that other lane
+    shared: int = 0  # number of following lanes with the same flight and other sensors
+    rough: bool = False  # whether its steps are longer
+    skip: int = -1  # index of a command that is lost: the previous one stays in force
 
 
 class ReplayedFlights:
     """Windows of recorded flights as the replay's arrays.
 
     Attributes:
-        cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in
-            vectors. recording: for a replay. first_command: number of each flight's first.
-        time: stamps of each window's samples [s], shape (N,). sigma: their noise.
+        cuts: the windows. knots: number of knots of each window, shape (W,). rows: number of output
+            vectors of each window. recording: arrays for the replay. first_command: index of each
+            flight's first command. time: stamps of each window's samples [s], shape (N,). sigma:
+            their noise.
     """
 
     def __init__(
@@ -130,9 +127,8 @@ class ReplayedFlights:
         cuts: Sequence[Cut],
         setting: Setting,
     ):
-        """Lay out flights and windows in the time of their sensors.
-
-        ``setting``: whose delays of sensors and release are known.
+        """Arrange the samples of all windows; ``setting``: with the known delays of sensors and
+        release.
         """
         x = setting.sensing
         delays = x.vehicle_delay, x.vehicle_delay, x.payload_delay, x.gyro_delay
@@ -170,7 +166,7 @@ class ReplayedFlights:
             stamps = vehicle.time.repeat(2), payload.time, gyro.time
             self.time.append(np.concatenate(stamps).repeat(3))
             measured = np.zeros((len(self._groups[w]), 3))
-            has_value = self._groups[w] != 1  # attitudes are measured against themselves
+            has_value = self._groups[w] != 1  # the replay returns differences of attitudes
             measured[has_value] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
@@ -185,7 +181,7 @@ class ReplayedFlights:
         return samples
 
     def _row(self, w: int) -> dict[str, float]:
-        """Return a window's fields, without the ranges of its stamps."""
+        """Return a window's fields, but for the ranges of its stamps."""
         c = self.cuts[w]
         f = self.flights[c.flight]
         reach = c.start - LATEST, c.end + LATEST
@@ -204,21 +200,23 @@ class ReplayedFlights:
         }
 
     def separation(self, w: int) -> float:
-        """Return when the payload of a window's flight leaves, as far as known [s]."""
+        """Return the expected time of the separation in a window's flight [s]."""
         return self.flights[self.cuts[w].flight].latch + self._lag
 
     def kind(self, w: int) -> tuple[int, bool]:
-        """Return the payload at a window's start, and whether the latch holds it until the end."""
+        """Return the kind of payload at a window's start, and whether it is not released in it."""
         c = self.cuts[w]
         return c.payload, self.flights[c.flight].latch >= c.end
 
     def spread(self, w: int, *values: float) -> ndarray:
-        """Give every sample of a window the value of its kind: vehicle, attitude, payload, gyro."""
+        """Return for every sample of a window the value of its kind: vehicle, attitude, payload or
+        gyro.
+        """
         return np.repeat(np.array(values)[self._groups[w]], 3)
 
     def residual(self, measured: ndarray, w: int, lane: int) -> ndarray:
-        """Measured minus simulated, shape (N,); of an attitude the rotation vector from the
-        simulated to the measured.
+        """Return measured minus simulated samples, shape (N,); for an attitude, the rotation vector
+        from the simulated to the measured one.
         """
         return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
 
@@ -229,13 +227,13 @@ class ReplayedFlights:
         lanes: Sequence[Lane],
         recording: Recording | None = None,
     ) -> Replayed:
-        """Fly lanes.
+        """Simulate lanes.
 
         Args:
-            simulation: whose settings the lanes choose from.
-            states: initial states that the lanes choose from.
-            lanes: at most some thousand, for the memory's sake.
-            recording: the windows, if not as they are.
+            simulation: settings to which the lanes refer.
+            states: initial states to which the lanes refer.
+            lanes: at most some thousand, to limit memory.
+            recording: the windows, if changed.
         """
         columns = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
         rough = columns.pop("rough").astype(int)
@@ -254,7 +252,7 @@ class ReplayedFlights:
         lanes: Sequence[Lane],
         recording: Recording | None = None,
     ) -> list[ndarray]:
-        """Fly lanes; returns each one's residual, see :meth:`residual` and :meth:`fly`."""
+        """Simulate lanes; return the residual of each, see :meth:`residual` and :meth:`fly`."""
         samples = self.fly(simulation, states, lanes, recording).samples
         return [self.residual(samples, lane.window, i) for i, lane in enumerate(lanes)]
 
@@ -265,8 +263,8 @@ class ReplayedFlights:
         groups: Sequence[Sequence[Lane]],
         recording: Recording | None = None,
     ) -> list[ndarray]:
-        """Fly lanes of some windows, a group of each window; returns what the others of a group
-        see, less what its first lane sees, shape (N, lanes - 1) each; see :meth:`fly`.
+        """Simulate groups of lanes, a group for each window. Return the samples of each lane minus
+        those of its group's first lane, shape (N, lanes - 1) for each group; see :meth:`fly`.
         """
         lanes = [lane for group in groups for lane in group]
         samples = self.fly(simulation, states, lanes, recording).samples
@@ -281,13 +279,13 @@ class ReplayedFlights:
         return differences
 
     def ended(self, ends: Sequence[float]) -> Recording:
-        """The windows that end earlier [s]; what is seen afterwards says nothing."""
+        """Return the recording with earlier ends of windows [s]; later samples are undefined."""
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
 
 
 def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: ChannelSamples):
-    """Return which kind each row of a window is of: positions and attitudes in turns, then payload
-    and gyro.
+    """Return the kind of each row of a window: positions and attitudes in turns, then payload, then
+    gyro.
     """
     pairs = np.tile([0, 1], len(vehicle.time))
     rest_of_rows = np.repeat([2, 3], [len(payload.time), len(gyro.time)])
@@ -295,8 +293,8 @@ def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: Channe
 
 
 def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:
-    """Whether windows of a kind are flown alike in two settings, which may be seen otherwise: what
-    differs does nothing in them.
+    """Return whether two settings lead to the same motion in windows of a kind. They may differ in
+    sensors and in parameters without effect there.
     """
     payload, holds = kind
     plant = second.plant
@@ -310,12 +308,11 @@ def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bo
 
 
 def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, States]:
-    """Initial states of all windows: smoothed measurements and, for what nobody measures, what
-    flying through the windows before gives.
+    """Return the initial states of all windows and the states at their ends.
 
-    ``flights``: the windows, those of one flight in order of time; ``simulation``: of one setting.
-    Returns the states, and those at the windows' ends that they lead to.
-    """
+    Measured fields are smoothed measurements. Other fields are carried on from the end of the
+    preceding window by simulation. ``flights``: the windows of each flight in order of time;
+    ``simulation``: of one setting."""
     (setting,) = simulation.settings
     by_flight = groupby(range(len(flights.cuts)), key=lambda w: flights.cuts[w].flight)
     states: list[States | None] = [None] * len(flights.cuts)
@@ -326,7 +323,7 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
         for w in windows:
             c = flights.cuts[w]
             flight = flights.flights[c.flight]
-            # in a gap the inner states have gone
+            # after a gap, the fields that are not measured start from a hover
             gap = k == 0 or c.start > flights.cuts[w - 1].end + 1e-6
             inner = hover_state(flight, setting.plant) if gap else ends[w - 1]
             states[w] = measured_state(flight, c.start, setting, c.payload, inner)

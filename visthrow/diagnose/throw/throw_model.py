@@ -1,4 +1,4 @@
-"""The whole throw as a model to diagnose: vehicle, rope, payload and release replayed from recorded
+"""The model of a whole throw: vehicle, rope, payload and release, replayed from recorded
 commands.
 """
 
@@ -51,18 +51,18 @@ OTHER_CHARGE = (
     "; battery_charge stands for a fuller or emptier pack, which intervals of thrust leave out"
 )
 REPLAYED = ("pos_w", "quat_wb", "payload_pos_w", "rate_b")  # channels that a replay shows
-AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
-FINER = 4  # times as fine a step, by which the step's error is measured
+AFTER_SLACK = 0.05  # time that a rope takes to become taut [s]
+FINER = 4  # factor by which the step is shortened to measure its error
 
 
 class ThrowModel(Model):
     """Flights of a vehicle, with or without a payload, against the simulator that training uses.
 
     Attributes:
-        effects: of the catalogue that concern this plant and these logs.
-        channels: measured ones.
-        entries: name -> entry of the catalogue.
-        setting: what the residuals at theta = 0 are simulated with.
+        effects: entries of the catalogue that apply to this plant and these logs.
+        channels: measured channels.
+        entries: name -> effect.
+        setting: the parameters at theta = 0.
     """
 
     def __init__(
@@ -78,20 +78,20 @@ class ThrowModel(Model):
         carries: bool | None = None,
         simpler: bool = False,
     ):
-        """Cut the flights and find the windows' initial states.
+        """Cut the flights into windows and fit their initial states.
 
-        Raises DiagnoseError: no flight can be replayed, or ``only`` names what does not exist.
+        Raises DiagnoseError: no flight can be replayed, or ``only`` names an unknown effect.
 
         Args:
-            sensing: what is known of the sensors.
+            sensing: known delays and offsets of the sensors.
             device: "cpu" or "cuda:0".
             substep: largest integration step [s].
-            only: names of the effects to consider; default all that apply.
+            only: names of the effects to consider; default: all that apply.
             carries: whether a payload hangs below in all flights; default: in those in which one
                 was measured or released.
-            simpler: consider also blocks simpler than the plant's, such as a rigid rope; each
-                compiles a kernel.
-            camera: whose keypoints the logs hold.
+            simpler: whether to consider blocks simpler than the plant's, such as a rigid rope; each
+                of them compiles a kernel.
+            camera: the camera whose keypoints the logs hold.
         """
         self.setting = generalise(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device = device
@@ -121,7 +121,7 @@ class ThrowModel(Model):
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
-        """Cut flights into windows, fewer where there are many."""
+        """Cut flights into windows, and thin these if there are many."""
         release = self.setting.plant.release
         cuts: list[Cut] = []
         for i, flight in enumerate(flights):
@@ -140,7 +140,7 @@ class ThrowModel(Model):
     def _settle_without_slack(
         self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
     ) -> States:
-        """Take the windows without the time in which ropes were slack; returns initial states."""
+        """Set up the windows without the time in which ropes were slack; return initial states."""
         self.flights = ReplayedFlights(flights, cuts, self.setting)
         simulation = self.simulation(self.setting)
         states, ends = carried(self.flights, simulation)
@@ -151,10 +151,10 @@ class ThrowModel(Model):
         return states
 
     def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
-        """Take effects by their names: first those that are simulated by degrees, then switches,
-        then what only cameras see.
+        """Set the effects by their names: first those of continuous size, then switches, then those
+        that only cameras show.
 
-        Raises DiagnoseError: one does not concern these flights.
+        Raises DiagnoseError: an effect does not apply to these flights.
         """
         expect_known(names, concerned, "no effect '{}' for these flights", DiagnoseError)
         effects = [concerned[name] for name in names]
@@ -164,7 +164,7 @@ class ThrowModel(Model):
         self._switched = [e for e in effects if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
-        # of other kinds of blocks, by their name, where they were asked for first
+        # columns of switches, by name, taken where each was first needed
         self._secants: dict[str, list[ndarray]] = {}
 
     def at(self, theta: Mapping[str, float]) -> Setting:
@@ -172,9 +172,7 @@ class ThrowModel(Model):
         return apply(self.entries, self.setting, theta)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.model_interface.Model`; with what was seen
-        besides poses.
-        """
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         setting = self.at(theta)
         ways = directions(setting.plant)  # another kind of block has other states
         states = self._settled_at[_key(theta)] = self._settled(setting)
@@ -199,10 +197,10 @@ class ThrowModel(Model):
         return whole
 
     def _add_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
-        """Return windows with columns of other kinds of blocks, and empty ones of what cameras
-        alone show.
+        """Return the windows with columns of the switches, and zeros for effects that only cameras
+        show.
         """
-        for e in self._switched:  # they are screened by these, and judged where they are flown
+        for e in self._switched:  # columns serve the screening; a switch is judged by simulation
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, listed)
         secants = [self._secants[e.name] for e in self._switched]
@@ -217,11 +215,11 @@ class ThrowModel(Model):
     def _secant(
         self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
     ) -> list[ndarray]:
-        """Samples with the other kind of block less those with this one, per theta; a column for
-        each window.
+        """Return the change of the samples if a block is switched, per theta; a column for each
+        window.
 
-        Each kind begins in initial states settled for it: a transient that the other's state brings
-        would be taken for its effect."""
+        Initial states are fitted for each kind of block. Otherwise the transient from a state of
+        the other kind would count as an effect of the switch."""
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = self.at({**theta, e.name: 0.0 if on else 1.0})
         sign = -1.0 if on else 1.0
@@ -235,7 +233,7 @@ class ThrowModel(Model):
         return columns
 
     def _flown(self, setting: Setting, states: States) -> list[ndarray]:
-        """Residuals of all windows' replayed samples in a setting."""
+        """Return the residuals of all windows' replayed samples in a setting."""
         lanes = [Lane(w, 0, w) for w in self._retained]
         return self.flights.residuals(self.simulation(setting), states, lanes)
 
@@ -260,9 +258,9 @@ class ThrowModel(Model):
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """See the base class.
 
-        A radio link loses commands or brings them late, and the vehicle goes on with what it has;
-        the log holds what was sent. Each window is flown once for each of its commands, with the
-        one before in its place."""
+        A radio link may lose commands or deliver them late. The vehicle then keeps the previous
+        command, while the log holds the one that was sent. Each window is simulated once for each
+        of its commands, with the previous command in its place."""
         flights = self.flights
         delay = self.setting.plant.vehicle.queue.delay
         groups = {}
@@ -283,8 +281,8 @@ class ThrowModel(Model):
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
     ) -> tuple[States, dict[int, ndarray]]:
-        """States that belong to other sizes of the effects by the derivatives, and how each
-        window's were moved.
+        """Adjust the states to other sizes of the effects by the derivatives; return the states and
+        each window's displacement from its prior mean.
         """
         before = linearised.theta
         change = np.array([theta.get(name, 0.0) - before.get(name, 0.0) for name in self.entries])
@@ -312,19 +310,19 @@ class ThrowModel(Model):
     landings = landings
 
     def begun(self, theta: Mapping[str, float], cuts: Sequence[Cut]) -> tuple[Setting, States]:
-        """The setting with effects at ``theta``, and states fitted in it at the starts of windows
-        of the model's flights.
+        """Return the setting with effects at ``theta``, and the initial states of other windows of
+        the model's flights, fitted in it.
         """
         setting = self.at(theta)
         flights = ReplayedFlights(self.flights.flights, cuts, self.setting)
         return setting, InitialFit(flights, self.simulation(setting)).settled({})
 
     def simulation(self, *settings: Setting) -> Simulation:
-        """Settings ready to be flown in, with this model's steps."""
+        """Prepare settings for simulation with this model's steps."""
         return Simulation(settings, self.substep, self.device)
 
     def _settled(self, setting: Setting) -> States:
-        """States fitted in a setting, from those that the setting begins with."""
+        """Return the initial states fitted in a setting."""
         states, slopes = self._nominal
         if setting == self.setting:
             return states
@@ -335,8 +333,8 @@ class ThrowModel(Model):
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
-        """Step of theta for the derivative: upwards, unless that leaves the bounds; none of another
-        kind of block.
+        """Return the finite difference of theta for an effect: upwards unless that exceeds the
+        bounds, 0 for a switch.
         """
         step = 0.0 if e.switch else e.step * e.floor
         return -step if theta + step > e.bounds[1] else step
@@ -347,11 +345,11 @@ class ThrowModel(Model):
         return self.flights.spread(w, *numbers).astype(int)
 
     def _cut_slack(self, ends: States) -> list[Cut]:
-        """The windows, with the time in which the rope was slack until their ends cut out; those
-        soon after it are marked so.
+        """Cut the time in which the rope was slack out of the windows, and mark those soon after
+        it; ``ends``: states at the windows' ends.
         """
         cuts: list[Cut] = []
-        rings: dict[int, float] = {}  # flight -> until when
+        rings: dict[int, float] = {}  # flight -> time until which its rope may whip
         for w, c in enumerate(self.flights.cuts):
             first = float(ends["slack_first"][w])
             last = float(ends["slack_last"][w])
@@ -369,8 +367,8 @@ class ThrowModel(Model):
 def effects_for(
     setting: Setting, channels: set[str], payload: bool, releases: bool, simpler: bool = False
 ) -> dict[str, SettingEffect]:
-    """Return effects that make sense in a setting and for logs with these channels, bounded by the
-    setting's own values.
+    """Return the effects that apply to a setting and to logs with these channels, with bounds
+    derived from the setting.
 
     ``simpler``: whether blocks simpler than the setting's are considered.
     """
@@ -397,7 +395,7 @@ def effects_for(
 
 
 def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
-    """The sizes that are not 0."""
+    """Return the sizes that are not 0."""
     return frozenset((name, float(value)) for name, value in theta.items() if value)
 
 
