@@ -1,13 +1,13 @@
-"""Candidates of a selection: effects, other kinds of blocks, terms of laws, and shares of effects
-that flights or days have for themselves.
+"""Candidates of the selection: effects, other kinds of blocks, terms of laws, and random shares of
+effects.
 
-A candidate is a group of columns of the windows with a prior and a penalty. Whatever it stands for,
-a set of candidates is worth its marginal likelihood less the penalties of its members.
+A candidate is a group of columns of the windows, with a prior and a penalty. The value of a set of
+candidates is its log marginal likelihood minus the penalties of its members.
 
-A flight, or a day, has its own share of an effect, normal about what all share, with a deviation
-theta. These random shares are integrated out of the statistics (:func:`freed`). A flight far from
-the others is simulated again at other sizes: a release 40 ms early tells twice of it by its
-derivative.
+A random share is the deviation of an effect's size in one flight, or on one day, from the size that
+all flights have in common. It is normal with standard deviation theta and is integrated out of the
+statistics (:func:`freed`). A flight far from the others is simulated again at other sizes, because
+the derivative is inexact that far away: it doubles the size of a release that is 40 ms early.
 
 Source: Laird and Ware 1982 (random effects).
 """
@@ -25,51 +25,51 @@ from visthrow.diagnose.likelihood.evidence import FEWEST, INEXACT, Posterior, Pr
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-ALL = "all"  # group of a candidate whose size all flights share
-FLIGHT = "flight"  # of one of which each flight has a share of its own
-DAY = "day"
-EVENT = "event"  # one flight alone has one
-COMMAND = "command"  # what has a share of its own, beside flights and days
+ALL = "all"  # group of a candidate that has one size in all flights
+FLIGHT = "flight"  # group of a candidate with a random share for each flight
+DAY = "day"  # with a random share for each day
+EVENT = "event"  # with a share in a single flight
+COMMAND = "command"  # lost commands, which vary by command
 
 REACH = np.geomspace(0.02, 6.0, 25)
-"""Deviations that are tried, in their prior's."""
-COARSE = 3  # one of so many of them suffices to compare candidates
+"""Standard deviations of random shares that are tried, relative to the prior's."""
+COARSE = 3  # every third of them suffices to compare candidates
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
-"""At which flights are simulated again, in the largest estimate of any flight."""
-FINE = 400  # places between them at which a curve is looked at
+"""Sizes at which flights are simulated again, relative to the largest estimate of any flight."""
+FINE = 400  # points at which the curve through them is evaluated
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A cause that may be selected."""
+    """A candidate of the selection."""
 
     name: str
-    columns: tuple[int, ...]  # numbers of the effects that it concerns
-    group: str = ALL  # who has a size: ALL flights one, each FLIGHT, each DAY, or one in an EVENT
+    columns: tuple[int, ...]  # indices of its effects
+    group: str = ALL  # ALL, FLIGHT, DAY or EVENT: which flights have a common size
     penalty: float = 0.0  # beyond the threshold [nats]
-    deviations: tuple[float, ...] = ()  # prior of random shares, in floors; one a column
-    floors: float = 0.0  # negligible deviation of random shares, in the prior's
+    deviations: tuple[float, ...] = ()  # prior deviation of random shares by column, in floors
+    floors: float = 0.0  # negligible deviation of random shares, relative to the prior's
     flight: int = -1  # of an event
-    law: str = ""  # block of the law whose term it is
-    claims: int = 1  # thresholds that it must beat: that an effect exists, that it differs
+    law: str = ""  # block of the law, for a term
+    claims: int = 1  # number of thresholds to exceed: that an effect exists, that it varies
 
     def __hash__(self) -> int:
-        """Hash numbers alone: with names, the order of a set would differ from run to run."""
+        """Hash numbers alone; hashes of strings would change the order of sets between runs."""
         return hash((self.columns, self.flight))
 
 
 Names = frozenset[Candidate]
 NOTHING: Names = frozenset()
 Shares = Mapping[Candidate, float]
-"""Deviation of random shares, in their prior's."""
+"""Standard deviation of random shares, relative to the prior's."""
 Deviations = Iterable[tuple[int, float | ndarray]]
-"""Number of each effect of which rows have shares, and the shares' deviation in floors, of all rows
-or of each, shape (F,).
+"""Index of each effect with random shares, and their standard deviation in floors: one for all
+rows, or one for each, shape (F,).
 """
 
 
 def shared(effects: Sequence[Effect]) -> list[Candidate]:
-    """Return every effect as a candidate whose size all flights share."""
+    """Return a candidate for every effect, with one size in all flights."""
     offered = []
     for j, e in enumerate(effects):
         penalty, law = (e.price, e.block) if isinstance(e, TermEffect) else (0.0, "")
@@ -83,15 +83,15 @@ def random_shares(
     statistics: Statistics,
     all_effects: bool = True,
 ) -> list[Candidate]:
-    """Return what flights, or days, may have for themselves, where at least two of them show it.
+    """Return the random shares that at least two flights, or days, can show.
 
     Args:
         effects: of the model, without terms of laws, shape (K,).
         statistics: of the flights.
-        all_effects: whether of every effect, not of the catalogue's random effects alone.
+        all_effects: whether any effect may vary, rather than the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
-    groups = {FLIGHT: flown}  # which effects each shows
+    groups = {FLIGHT: flown}  # which effects each flight or day shows
     days = np.array(statistics.days)
     by_day = [flown[days == day].any(0) for day in np.unique(days)]
     if 1 < len(by_day) < len(flown):
@@ -120,8 +120,8 @@ def random_shares(
 
 
 def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
-    """Yield the catalogue's random effects, then every other effect as one, with their penalties:
-    of all effects, one varies more by chance.
+    """Yield the catalogue's random effects, then every other effect as a random one, with their
+    penalties: among many effects, one seems to vary by chance.
     """
     named = [v for v in random_effects() if v.of]
     yield from ((v, 0.0) for v in named)
@@ -132,7 +132,7 @@ def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
 
 
 def as_random(effect: Effect) -> RandomEffect:
-    """Return an effect as one whose size differs from flight to flight."""
+    """Convert an effect into a random effect, whose size differs from flight to flight."""
     return RandomEffect(
         effect.name,
         f"{effect.cause}, now more, now less",
@@ -150,7 +150,7 @@ def as_random(effect: Effect) -> RandomEffect:
 def _events(
     effects: Sequence[Effect], priors: Priors, flights: ndarray, flown: ndarray
 ) -> list[Candidate]:
-    """Return each effect in each flight alone."""
+    """Return candidates for each effect in each single flight."""
     penalty = np.log(max(flown.size, 1))
     offered = []
     for j, e in enumerate(effects):
@@ -165,13 +165,13 @@ def _events(
 
 
 def without_means(chosen: Iterable[Candidate]) -> list[Candidate]:
-    """Return candidates without the means of those whose existence is one of their claims."""
+    """Drop effects that also occur as random shares, as the claims of these include existence."""
     varying = {c.columns for c in chosen if c.claims > 1}
     return [c for c in chosen if c.claims > 1 or c.columns not in varying]
 
 
 def columns_of(chosen: Iterable[Candidate]) -> list[int]:
-    """Return the numbers of the effects whose size all flights share."""
+    """Return the indices of the effects that have one size in all flights."""
     return sorted(j for c in chosen if c.group == ALL for j in c.columns)
 
 
@@ -181,13 +181,13 @@ def laws_of(chosen: Iterable[Candidate]) -> list[Candidate]:
 
 
 def unit_suffix(unit: str) -> str:
-    """Return a unit as it stands after a number: nothing where it is dimensionless."""
+    """Return a unit for printing after a number, empty if dimensionless."""
     return "" if unit == "1" else f" {unit}"
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """The verdict on one quantity that may vary."""
+    """The verdict on a quantity that may vary between flights, days or commands."""
 
     name: str
     cause: str
@@ -200,16 +200,16 @@ class Scatter:
     low: float  # 95 % interval [unit]
     high: float
     floor: float  # [unit]
-    nats: float  # of evidence that it varies at all
-    flights: int  # or days or commands, that say something about it
+    nats: float  # evidence that it varies
+    flights: int  # number of flights, days or commands that show it
     manoeuvres: tuple[str, ...] = ()
     by: str = FLIGHT  # or DAY, or COMMAND
-    # effect -> mean of these flights [unit]: what is expected of another flight
+    # effect -> mean over these flights [unit], which is expected in another flight
     mean: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def sentence(self) -> str:
-        """For people."""
+        """Describe the verdict for the report."""
         unit = unit_suffix(self.unit)
         size = f"{self.name} = {self.size:.3g}{unit} (95 %: {self.low:.3g} to {self.high:.3g})"
         drifts = "drifts, a value for each day. " if self.by == DAY else ""
@@ -223,17 +223,17 @@ def relinearised_per_flight(
     j: int,
     simulate: Callable[[ndarray], Statistics | None],
 ) -> Statistics:
-    """Statistics whose scores are those about the size of one effect at which each flight fits best
-    by itself.
+    """Correct the scores of flights for the curvature of one effect: simulate it at several sizes
+    and linearise each flight at the size that fits it best.
 
     ``theta``: estimated sizes, in floors; ``simulate``: simulates the flights at other sizes, in
-    floors, or returns None where that fails.
+    floors, or returns None if that fails.
     """
     information = statistics.information[:, j, j]
     misfit = statistics.about(theta).score[:, j]
     flown = np.flatnonzero(information > 0.0)
     reach = np.abs(misfit[flown] / information[flown]).max(initial=0.0)
-    if INEXACT * reach < 1.0:  # the derivative is off by less than a floor
+    if INEXACT * reach < 1.0:  # the derivative's error is below a floor
         return statistics
     unit = np.eye(len(theta))[j]
     places = np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])
@@ -259,13 +259,13 @@ def relinearised_per_flight(
 def over_deviations(
     sizes: ndarray, nats: ndarray, none: float | None = None
 ) -> tuple[float, tuple[float, float], float]:
-    """Return the most probable deviation, its 95 % interval, and the evidence of all, which are
-    half normal before.
+    """Return the most probable standard deviation of random shares, its 95 % interval, and the
+    evidence integrated over a half-normal prior.
 
     Args:
-        sizes: deviations that were tried, from small to large, above 0, in their prior's.
-        nats: of evidence of each.
-        none: nats of no deviation, if that is one of them.
+        sizes: deviations that were tried, ascending, above 0, relative to the prior's.
+        nats: evidence of each.
+        none: evidence of a deviation of 0, if that is possible.
     """
     size = np.geomspace(sizes[0], sizes[-1], FINE)
     value = PchipInterpolator(np.log(sizes), nats)(np.log(size))
@@ -289,14 +289,14 @@ def judged(
     flights: int,
     group: str = FLIGHT,
 ) -> Scatter:
-    """The verdict on a quantity by the evidence of its sizes.
+    """Judge whether a quantity varies, from the evidence of several deviations.
 
     Args:
-        reach: sizes that were tried, from small to large, above 0.
-        nats: of evidence of each against none.
-        threshold: that a finding needs.
-        flights: or days or commands, that say something of it.
-        group: what has shares.
+        reach: deviations that were tried, ascending, above 0, in the quantity's unit.
+        nats: evidence of each, relative to a deviation of 0.
+        threshold: evidence that a finding needs.
+        flights: number of flights, days or commands that show it.
+        group: FLIGHT, DAY or COMMAND.
     """
     mode, (low, high), evidence = over_deviations(reach / v.prior_sd, nats, none=0.0)
     mode *= v.prior_sd
@@ -320,8 +320,8 @@ def judged(
 
 
 def allowed(size: float) -> float:
-    """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
-    floors.
+    """Return the standard deviation between flights that is tolerated: a floor and a part of the
+    effect's size, in floors.
     """
     return float(np.hypot(1.0, INEXACT * size))
 
@@ -329,18 +329,19 @@ def allowed(size: float) -> float:
 def between_flights(
     statistics: Statistics, priors: Priors, active: Sequence[int], theta: ndarray
 ) -> tuple[float, ndarray]:
-    """Return the variance among flights that named effects may have, in that which is
-    :func:`allowed`, and the part of it that the mean of these flights keeps, shape (K,).
+    """Estimate the variance of selected effects between flights, relative to that which is
+    :func:`allowed`; return it and the part of it that remains in the mean of these flights, shape
+    (K,).
 
-    In each flight a name may have a share of its own, whose deviation is u times what is allowed.
-    What the flights say of u, which is half normal before, is integrated over: one flight alone
-    says nothing of it, and many that agree leave little. Where nothing is named, nothing varies.
-    ``theta``: their sizes, in floors.
+    Each flight may have a share of each selected effect, with a standard deviation of u times the
+    allowed one. The variance is averaged over the posterior of u, whose prior is half normal. One
+    flight says nothing about u; many that agree leave a small one. It is 0 if no effect is
+    selected. ``theta``: sizes, in floors.
 
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
     information = statistics.information.diagonal(axis1=1, axis2=2)
-    share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F of F that say as much
+    share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F for F equal flights
     sd = {j: allowed(theta[j]) for j in active}
     nats = []
     for u in REACH:
@@ -353,16 +354,15 @@ def between_flights(
 
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
-    """Return log Z of a set of effects, comparable between shares that were integrated out."""
+    """Return log Z of a set of effects, comparable between different integrated shares."""
     square = float(statistics.absolute.square.sum())
     return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square
 
 
 def freed(statistics: Statistics, shares: Shares) -> Statistics:
-    """Statistics of what flights, or days, share: the shares that each has of its own are
-    integrated out.
+    """Integrate the random shares out of the statistics.
 
-    Where days have shares, what is returned is of days."""
+    The rows of the result are days if days have shares, else flights."""
     of_flights = integrated(statistics, _of_rows(shares, statistics.flights))
     if not drifting(shares):
         return of_flights
@@ -371,14 +371,14 @@ def freed(statistics: Statistics, shares: Shares) -> Statistics:
 
 
 def drifting(shares: Shares) -> Shares:
-    """Return the shares that days have."""
+    """Return the random shares of days."""
     return {c: size for c, size in shares.items() if c.group == DAY}
 
 
 def _of_rows(shares: Shares, numbers: ndarray, group: str = FLIGHT) -> Deviations:
-    """Yield the shares of flights, of all or of one alone, or those of days.
+    """Yield the random shares of flights (or of the one flight of an event), or those of days.
 
-    ``numbers``: of the flights, or days."""
+    ``numbers``: of the flights or days."""
     for c, size in shares.items():
         if (c.group == DAY) == (group == DAY):
             has_share = (c.group != EVENT) | (numbers == c.flight)
@@ -387,7 +387,7 @@ def _of_rows(shares: Shares, numbers: ndarray, group: str = FLIGHT) -> Deviation
 
 
 def integrated(statistics: Statistics, deviations: Deviations) -> Statistics:
-    """Integrate out the shares that each row has of some effects."""
+    """Integrate out each row's shares of some effects."""
     columns, root, part, precision = _unit_shares(statistics, deviations)
     if not columns:
         return statistics
@@ -406,8 +406,8 @@ def integrated(statistics: Statistics, deviations: Deviations) -> Statistics:
 def _unit_shares(
     statistics: Statistics, deviations: Deviations
 ) -> tuple[list[int], ndarray, ndarray, ndarray]:
-    """Return the effects' numbers, the shares' deviations (F, m), the information on shares in
-    these and on effects (F, m, K), and the posterior precision of the shares (F, m, m).
+    """Return, for shares scaled to unit deviation: the effects' indices, the deviations (F, m), the
+    information on shares and effects (F, m, K), and the shares' posterior precision (F, m, m).
     """
     pairs = list(deviations)
     columns = [j for j, _ in pairs]
@@ -419,11 +419,10 @@ def _unit_shares(
 
 
 def estimate_shares(statistics: Statistics, theta: ndarray, shares: Shares) -> ndarray:
-    """Most probable share of each flight of the effects that vary, beside the sizes of all, in
-    floors, shape (F, K).
+    """Estimate each flight's random shares, in floors, shape (F, K).
 
-    ``theta``: sizes that all flights share, in floors. The shares of days come first, and flights
-    share what is left of them."""
+    ``theta``: common sizes of the effects, in floors. Shares of days are estimated first, those of
+    flights from the remainder."""
     sizes = np.zeros(statistics.score.shape)
     of_flights = list(_of_rows(shares, statistics.flights))
     if drifting(shares):
@@ -434,7 +433,7 @@ def estimate_shares(statistics: Statistics, theta: ndarray, shares: Shares) -> n
 
 
 def _shares(statistics: Statistics, theta: ndarray, deviations: Deviations) -> ndarray:
-    """Return the most probable shares of each row, shape (F, K), beside its sizes ``theta``."""
+    """Return the most probable shares of each row, shape (F, K), given the sizes ``theta``."""
     columns, root, _, precision = _unit_shares(statistics, deviations)
     off = root * statistics.about(theta).score[:, columns]
     sizes = root * np.linalg.solve(precision, off[..., None])[..., 0]

@@ -1,14 +1,13 @@
-"""Occam's window: the sets of candidates that the statistics of some flights leave in question.
+"""Occam's window: the sets of candidates that are nearly as good as the best one.
 
 A set S of candidates has the value
 
     V(S) = log Z(S) - sum of its members' penalties
 
-with log Z as in :mod:`visthrow.diagnose.likelihood.evidence`. The deviation of random shares is
-integrated over its prior. The search opens the best set that was not opened yet, and lists its
-neighbours: one candidate more, two more, one less, one in place of another. It ends where no set
-near the best is unopened. What is left near the best is the answer: one set, or several that say
-the same.
+with log Z as in :mod:`visthrow.diagnose.likelihood.evidence`. The standard deviation of random
+shares is integrated over its prior. The best-first search expands the best set that it has not yet
+expanded, and lists the neighbours: one candidate more, two more, one less, or one replaced. It ends
+when all sets near the best have been expanded. The sets near the best are the answer.
 
 Source: Madigan and Raftery 1994 (Occam's window); Raftery 1995.
 """
@@ -39,20 +38,18 @@ from visthrow.diagnose.select.candidates import (
     over_deviations,
 )
 
-MOST_NEW = 2  # candidates in one move: of where many lead together, derivatives tell too little
+MOST_NEW = 2  # candidates added in one move; derivatives predict larger moves badly
 
 WINDOW = (MOST_NEW + 1) * VERY_STRONG
-"""Nats behind the best up to which sets are kept: what the candidates of a move cost, those that it
-adds and one that it takes away. Sets up to ``STRONG`` behind count as possible.
+"""Sets up to this many nats behind the best are kept: the penalties in a move, which adds up to
+``MOST_NEW`` candidates and may remove one. Sets up to ``STRONG`` behind count as possible.
 """
-PATIENCE = 8  # sets that are opened in vain before the search ends
-RANDOM_TRIED = (
-    4  # random shares whose evidence is calculated for each set, of those that may matter
-)
+PATIENCE = 8  # expansions without a better set before the search ends
+RANDOM_TRIED = 4  # most promising random shares, or pairs, that are evaluated for each set
 
 
 class Linear:
-    """Values of sets by the statistics of one point alone."""
+    """Values of sets from the statistics at one point, without simulation."""
 
     def __init__(
         self,
@@ -61,7 +58,7 @@ class Linear:
         candidates: Sequence[Candidate],
         penalty: Callable[[Names], float],
     ) -> None:
-        """Keep what values are made of; ``penalty``: of a set [nats]."""
+        """Store statistics, priors and candidates; ``penalty``: of a set [nats]."""
         self.statistics = statistics
         self.priors = priors
         self.penalty = penalty
@@ -74,8 +71,8 @@ class Linear:
         self._added: dict[Names, dict[Names, float]] = {}
 
     def shares(self, chosen: Names) -> tuple[dict[Candidate, float], float]:
-        """Return the deviations of a set's random shares, in their prior's, and the nats by which
-        they are worth more at their best than over their prior.
+        """Return the most probable deviations of a set's random shares, relative to the prior's,
+        and by how many nats the evidence there exceeds that integrated over the prior.
         """
         if chosen not in self._shares:
             listed: dict[Candidate, float] = {}
@@ -90,7 +87,7 @@ class Linear:
     def _deviation(
         self, chosen: Names, fixed: dict[Candidate, float], c: Candidate
     ) -> tuple[float, float]:
-        if c.group == EVENT:  # a size like any other: the slab is its prior
+        if c.group == EVENT:  # one size, whose prior is the slab
             return 1.0, 0.0
         sizes, nats = self.profile(chosen, fixed, c, REACH[::COARSE])
         mode, _, evidence = over_deviations(sizes, nats)
@@ -104,8 +101,8 @@ class Linear:
         c: Candidate,
         sizes: ndarray = REACH,
     ) -> tuple[ndarray, ndarray]:
-        """Return deviations of a random share that are not negligible, in its prior's, and the nats
-        by which log Z is higher with each than without the share.
+        """Return the deviations of a random share that are not negligible, relative to the prior's,
+        and the gain of log Z of each over a deviation of 0.
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active = columns_of(chosen)
@@ -119,7 +116,7 @@ class Linear:
         return sizes, np.array(nats[1:]) - nats[0]
 
     def value(self, chosen: Names) -> float:
-        """Return the value of a set."""
+        """Return the value of a set [nats]."""
         if chosen not in self._values:
             penalty = self.penalty(chosen)
             value = -np.inf
@@ -134,7 +131,7 @@ class Linear:
         return freed(self.statistics, self.shares(chosen)[0])
 
     def total(self, chosen: Names) -> Posterior:
-        """Return what all flights say beside a set's random shares."""
+        """Return the posterior of all flights with a set's random shares integrated out."""
         shares = frozenset(self.shares(chosen)[0].items())
         if shares not in self._totals:
             self._totals[shares] = Posterior.of(self._free(chosen), self.priors)
@@ -152,7 +149,7 @@ class Linear:
                 for c in self.plain:
                     new = subset | {c}
                     (j,) = c.columns
-                    if j in varying:  # whose shares are others about a mean
+                    if j in varying:  # a mean changes the deviation of its random shares
                         listed[new] = self.value(new)
                     elif gain[j] > self._step - WINDOW:
                         self._shares.setdefault(new, self.shares(subset))
@@ -164,8 +161,8 @@ class Linear:
         return self._added[subset]
 
     def _list_varying(self, subset: Names) -> list[Candidate]:
-        """Return the random shares that may be worth their penalty, those that promise most: each
-        as if no other effect could stand in for it.
+        """Return the most promising random shares that may exceed their penalty, each judged as if
+        no other effect could replace it.
         """
         if not self.random:
             return []
@@ -181,7 +178,9 @@ class Linear:
         return sorted(close, key=close.get, reverse=True)[:RANDOM_TRIED]
 
     def _promises(self, group: str, members: Sequence[Candidate], theta: ndarray) -> list[float]:
-        """Return the nats that random shares of one group promise beside these sizes [floors]."""
+        """Return the predicted gains of the random shares of one group [nats], at the sizes
+        ``theta`` [floors].
+        """
         flights = self.statistics.by(self.statistics.days) if group == DAY else self.statistics
         precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
         misfit = (flights.about(theta).score) ** 2 / precision
@@ -190,7 +189,7 @@ class Linear:
         deviations = [sd for c in members for sd in c.deviations]
         sizes = REACH[::COARSE]
         place = slice(None), columns
-        if group == EVENT:  # each in its flight alone
+        if group == EVENT:  # a share in one flight only
             sizes = np.ones(1)
             rows = np.searchsorted(flights.flights, [c.flight for c in members])
             place = rows[None], columns
@@ -201,8 +200,8 @@ class Linear:
         return (nats - [c.penalty for c in members]).tolist()
 
     def neighbours(self, chosen: Names, centre: Names) -> dict[Names, float]:
-        """Return sets one step away, with their values, and no more than ``MOST_NEW`` candidates
-        that a set does not have.
+        """Return the neighbours of a set with their values, limited to ``MOST_NEW`` candidates more
+        than ``centre`` has.
         """
         listed = {}
         for subset in (chosen, *(chosen - {c} for c in chosen)):
@@ -213,8 +212,8 @@ class Linear:
         return listed
 
     def pairs(self, chosen: Names) -> dict[Names, float]:
-        """Return sets with two candidates more, or in place of one or two: of two that hide each
-        other, neither shows alone.
+        """Return sets with two candidates more, which may replace one or two others, with their
+        values. Two effects that cancel each other show no gain alone.
         """
         listed: dict[Names, float] = {}
         for subset in (chosen - set(g) for n in range(3) for g in combinations(chosen, n)):
@@ -230,7 +229,7 @@ class Linear:
             alone = posterior.additions(active)[columns] - price
             both = posterior.pair_additions(active)[np.ix_(columns, columns)]
             worth = both - np.add.outer(price, price)
-            alone = np.maximum(alone, -1e9)  # of a name that cannot be there, as well as none
+            alone = np.maximum(alone, -1e9)  # instead of -inf, so that differences are finite
             synergy = worth - np.maximum.outer(alone, alone)
             synergy[np.tril_indices(len(columns))] = -np.inf
             for place in np.argsort(-synergy, axis=None)[:RANDOM_TRIED].tolist():
@@ -248,10 +247,10 @@ def window(
     """Return the sets near the best and their neighbours, with their values.
 
     Args:
-        begin: sets that are opened first.
-        centre: set that the derivatives belong to: others have at most ``MOST_NEW`` candidates
-            more.
-        pairs: whether two candidates are tried at once.
+        begin: sets with which the search begins.
+        centre: set at which the derivatives were taken; sets have at most ``MOST_NEW`` candidates
+            more than it.
+        pairs: whether pairs of candidates are tried.
     """
     values = {chosen: linear.value(chosen) for chosen in begin}
     opened: set[Names] = set()
