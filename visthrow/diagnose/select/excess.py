@@ -1,8 +1,7 @@
-"""Latent forces by block and phase: what still moves the vehicle after the causes were named, and
-whether that is too much.
+"""Latent forces by block and phase: the unexplained forces, and whether they are excessive.
 
-Gusts and draught do not know what the vehicle is doing. A latent force that is several times
-stronger in throws than in the quietest phase is no gust but something that the model lacks."""
+Gusts and draughts do not depend on what the vehicle does. A latent force that is several times
+stronger in throws than in the quietest phase is therefore an error of the model."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,20 +21,20 @@ from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Level
 
 LANDING = 5e-3
-"""Distance [m] that a latent force must move a body along an axis within a window, else it does not
-matter: a cause that moves a landing by less is below its floor as well.
+"""Smallest displacement of a body within a window [m] for which a latent force matters. The floors
+of effects correspond to the same error of a landing.
 """
 
-STEP = 1.4  # factor from one level to the next above the best, until one is too high
-MOST_STEPS = 60  # a level that nothing bounds from above ends here
+STEP = 1.4  # factor between the levels that are tried for an upper limit
+MOST_STEPS = 60  # largest number of them, where nothing limits the level
 
 
 def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     """Compare the latent forces of each block and phase with the block's quietest phase, and with
-    what would move a landing.
+    the force that would move a landing.
 
-    ``threshold``: nats from which a level would count as excessive if it were the only one; of
-    many, one is higher by chance."""
+    ``threshold``: evidence for an excessive level, if there were only one [nats]; it grows with
+    their number."""
     noise = after.noise
     threshold = threshold + np.log(max(len(noise.latent_sd), 1))
     limits = {key: _upper_limit(after, key) for key in noise.latent_sd}
@@ -57,16 +56,16 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
 
 
 def compares_phases(point: Point) -> bool:
-    """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the
-    sensors' noise.
+    """Return whether a calm phase shows how strong gusts are; otherwise residuals are compared with
+    the sensors' noise.
     """
     phases = Counter(block for block, _ in point.noise.latent_sd)
     return max(phases.values(), default=0) > 1
 
 
 def floors_of(point: Point) -> dict[tuple[int, str], float]:
-    """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
-    within the median window.
+    """Return the latent deviation [N or N m] of each block and phase that moves a position by
+    ``LANDING`` in the median window.
     """
     moves: dict[tuple[int, str], list[float]] = {}
     reaches = parallel_map(partial(_reaches, positions_of(point)), point.grams, point.windows)
@@ -78,8 +77,8 @@ def floors_of(point: Point) -> dict[tuple[int, str], float]:
 
 
 def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, float]:
-    """Return how far unit latents of each block move a position within a window [m]; nothing where
-    none was measured.
+    """Return how far unit latents of each block move a position within a window [m]; empty if no
+    position was measured.
     """
     rows = np.isin(window.channel, positions)
     if not rows.any():
@@ -93,13 +92,13 @@ def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, 
 
 
 def positions_of(point: Point) -> list[int]:
-    """Return the numbers of the channels that are positions."""
+    """Return the indices of the channels that are positions."""
     channels = point.problem.model.channels
     return [c for c, name in enumerate(channels) if unit_of(name) == "m"]
 
 
 def _likelihood(point: Point, key: tuple[int, str], level: float) -> float:
-    """Return the log likelihood of a phase's residuals under a level of a block and phase."""
+    """Return the log-likelihood of a phase's residuals for a level of a block and phase."""
     windows = [w for w, gram in enumerate(point.grams) if gram.phase == key[1]]
     noise = point.noise
     latent_sd = {**noise.latent_sd, key: level}
@@ -118,12 +117,11 @@ def _upper_limit(point: Point, key: tuple[int, str]) -> float:
 
 
 def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int] = ()) -> list[str]:
-    """Block through which each of some effects moves things, or "" where it moves measurements
-    alone.
+    """Return the block on which each of some effects acts, "" if it only changes measurements.
 
-    Its column is laid over the columns of each block's latent forces; the block that explains most
-    of it, and at least half, is it. ``point``: with the latent forces' derivatives;
-    ``free_effects``: effects that may take any size: what they can stand in for is left out."""
+    An effect's column is regressed on the columns of each block's latent forces. It acts on the
+    block that explains most of it, if that is at least half. ``point``: with the latent forces'
+    derivatives; ``free_effects``: effects of any size, which are regressed out first."""
     weight = point.noise.scale**-2.0
     total = np.zeros(len(effects))
     by_block = {name: np.zeros(len(effects)) for name in LATENT_BLOCKS}
@@ -146,9 +144,9 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
 
 
 def _explained_squares(inner: ndarray, basis: Sequence[int], columns: ndarray) -> ndarray:
-    """Parts of columns' squares that other columns explain.
+    """Return the part of each column's sum of squares that other columns explain.
 
-    ``inner``: inner products of all, shape (P, P); ``basis``: numbers of the others.
+    ``inner``: inner products of all columns, shape (P, P); ``basis``: indices of the others.
     """
     normal = inner[np.ix_(basis, basis)]
     right = inner[np.ix_(basis, columns)]
@@ -157,8 +155,8 @@ def _explained_squares(inner: ndarray, basis: Sequence[int], columns: ndarray) -
 
 
 def too_strong(point: Point, share: float) -> tuple[str, ...]:
-    """Phases in which the latent force on the vehicle exceeds a share of the thrust that carries
-    it.
+    """Return the phases in which the latent force on the vehicle exceeds a share of the thrust that
+    carries it.
     """
     thrusts: dict[str, list[float]] = {}
     for window in point.windows:

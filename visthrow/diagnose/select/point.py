@@ -1,5 +1,5 @@
-"""The state of a search: the model linearised at some sizes of its effects, with the noise levels
-that belong there.
+"""A point of the search: the model linearised at some sizes of its effects, with fitted noise
+levels.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,39 +35,34 @@ from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, 
 from visthrow.diagnose.select.candidates import Shares, estimate_shares, freed
 
 ROUNDS = 3
-"""Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,
-and rounds of lost windows: each round has some tenth of what the one before had to do.
+"""Limit for Gauss-Newton steps between two linearisations, for successive linearisations, and for
+rounds of dropping windows. Each of them leaves about a tenth of the error.
 """
 
 SMALL_STEP = 0.5 * MODEL_ERROR_FLOOR
-"""In floors: a step that is not worth a simulation, and the distance at which an estimate lies on
-its bound.
+"""A smaller step is not simulated, and an estimate this close to a bound counts as on it
+[floors].
 """
 
-TURNS = 8  # times at most that sizes and noise levels are estimated in turn
-TURNED = 0.5  # nats that a step of the sizes must be worth for another turn
+TURNS = 8  # largest number of alternations between sizes and noise levels
+TURNED = 0.5  # predicted gain of a step of the sizes below which these end [nats]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """The part of a search that never changes."""
+    """The fixed part of a search: model, windows and noise correlation."""
 
     model: Model
-    kept: tuple[int, ...]  # windows that are looked at
-    correlated: Mapping[int, Correlation] = field(
-        default_factory=dict
-    )  # channels whose noise is not white
-    terms: tuple[
-        TermEffect, ...
-    ] = ()  # of laws: further effects, whose columns follow from those of the latent forces
-    # probability of each command of each window that it did not come; none: all came
+    kept: tuple[int, ...]  # indices of the windows that are used
+    correlated: Mapping[int, Correlation] = field(default_factory=dict)  # by index of the channel
+    # terms of laws: further effects, whose columns follow from those of the latent forces
+    terms: tuple[TermEffect, ...] = ()
+    # probability that each command of each window was lost; empty: none was
     lost: tuple[ndarray, ...] = ()
 
     @staticmethod
     def of(model: Model, windows: Sequence[Window], numbers: Sequence[int]) -> "Problem":
-        """The problem of some of a model's windows, with the correlation of their
-        channels' noise.
-        """
+        """Set up a problem with some of a model's windows; estimate their noise correlation."""
         plain = Problem(model, tuple(numbers))
         slabs = plain.priors.slab * plain.priors.floor
         kept = [windows[i] for i in numbers]
@@ -80,22 +75,22 @@ class Problem:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """The model's, then the terms: K in all."""
+        """Return the effects of the model, then the terms: K in all."""
         return (*self.model.effects, *self.terms)
 
     @property
     def switches(self) -> ndarray:
-        """Which effects are another kind of block, shape (K,), bool."""
+        """Return which effects are switches to another kind of block, shape (K,), bool."""
         return np.array([e.switch for e in self.effects], dtype=bool)
 
     def only(self, windows: Sequence[int]) -> "Problem":
-        """Return the problem of some of its windows."""
+        """Return the problem with some of its windows."""
         lost = tuple(self.lost[w] for w in windows) if self.lost else ()
         return replace(self, kept=tuple(self.kept[w] for w in windows), lost=lost)
 
     def flown(self, theta: ndarray) -> Model | None:
-        """The model with the terms at their sizes as its laws; None where their columns do.
-        ``theta`` is in floors.
+        """Return the model with the terms at their sizes as laws; None if linear columns represent
+        them. ``theta`` is in floors.
         """
         if not self.terms or not self.model.bends:
             return None
@@ -106,8 +101,8 @@ class Problem:
         return self.model.with_laws(laws)
 
     def sizes(self, theta: ndarray) -> dict[str, float]:
-        """Sizes of the model's effects in their units, of those that are not 0, as they can have
-        them together; ``theta`` is in floors.
+        """Return the non-zero sizes of the model's effects in their units, limited to what is
+        possible together; ``theta`` is in floors.
         """
         sizes = {}
         for effect, size in zip(self.model.effects, theta):
@@ -116,7 +111,7 @@ class Problem:
         return dict(self.model.possible(sizes))
 
     def possible(self, theta: ndarray) -> ndarray:
-        """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
+        """Limit sizes to what is possible together; both in floors, shape (K,)."""
         sizes = self.sizes(theta)
         together = [sizes.get(effect.name, 0.0) for effect in self.model.effects]
         count = len(together)
@@ -125,36 +120,33 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Windows and statistics of a problem at one theta (in floors, shape (K,))."""
+    """Windows and statistics of a problem at sizes theta [floors], shape (K,)."""
 
     problem: Problem
     theta: ndarray
     windows: Sequence[Window]
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
-    plain: Statistics  # of flights without anything of their own
-    shares: Shares  # of effects that differ from flight to flight, or from day to day
+    plain: Statistics  # of flights, without random shares
+    shares: Shares  # of effects that vary between flights or days
     integrals: Integrals  # of the grams under these noise levels
-    about: Linearised  # where the model's derivatives were taken
-    commands: Sequence[
-        ndarray
-    ]  # change of each window by each command that did not come, shape (N, T); none: all came
+    about: Linearised  # windows and sizes at which the model's derivatives were taken
+    # change of each window if a command is lost, shape (N, T); empty if no commands may be lost
+    commands: Sequence[ndarray]
 
     @cached_property
     def by_window(self) -> Statistics:
-        """Return the statistics of windows without anything of their own."""
+        """Return the statistics of windows, without random shares."""
         return self.integrals.statistics(self.grams, self.theta)
 
     @cached_property
     def statistics(self) -> Statistics:
-        """Return the statistics of what flights share: each flight's random shares are integrated
-        out.
-        """
+        """Return the statistics of flights with their random shares integrated out."""
         return freed(self.plain, self.shares)
 
     @cached_property
     def posterior(self) -> Posterior:
-        """Return what all flights say of the effects."""
+        """Return the posterior of the effects from all flights."""
         return Posterior.of(self.statistics, self.problem.priors)
 
     @property
@@ -163,33 +155,30 @@ class Point:
         return self.posterior.information
 
     def sigma(self, channel: int) -> float:
-        """Median of what the model states as a channel's noise, in its unit; NaN where there is no
-        sample.
-        """
+        """Return the median of the stated noise of a channel, in its unit; NaN without samples."""
         sigmas = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
         return float(np.median(sigmas)) if len(sigmas) else float("nan")
 
     @cached_property
     def with_all_effects_noise(self) -> "Point":
-        """Return the point with the noise levels that remain when every effect may have its linear
-        estimate.
+        """Return the point with noise levels estimated with every effect at its linear estimate.
 
-        A large missing effect is taken for noise as long as it is not named; these levels show what
-        may be hidden under it."""
+        As long as a large effect is not selected, it raises the noise levels, which hide other
+        effects. These levels show what may be hidden."""
         visible = np.flatnonzero(self.problem.priors.visible & ~self.problem.switches)
         return with_noise_at(self, self.posterior.estimate(visible))
 
     def evidence(self, active: Sequence[int]) -> float:
-        """log Z of a set of effects, comparable between points with other noise levels."""
+        """Return log Z of a set of effects, comparable between points with other noise levels."""
         misfit = 0.5 * float(self.statistics.absolute.square.sum())
         return self.posterior.log_evidence(active) - misfit + self.noise.log_prior
 
 
 def regathered(point: Point, integrals: Integrals | None = None, **changes: Any) -> Point:
-    """The point with changes, and what its windows then say.
+    """Replace fields of a point and compute its statistics.
 
-    ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of
-    the point."""
+    ``integrals``: of the grams under the noise levels, if known; ``changes``: fields of the
+    point."""
     changed = replace(point, **changes)
     if integrals is None:
         integrals = Integrals(changed.grams, changed.noise)
@@ -213,10 +202,10 @@ def linearise(
     windows: Sequence[Window] | None = None,
     shares: Shares | None = None,
 ) -> Point:
-    """Simulate and linearise at ``theta``, estimate the noise levels, gather.
+    """Simulate and linearise at ``theta``, and fit the noise levels.
 
-    ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
-    model gave there, if it was asked already; ``shares``: random ones of effects."""
+    ``theta``: in floors, shape (K,); ``start``: noise levels from which their fit starts;
+    ``windows``: the model's windows at ``theta``, if known; ``shares``: random shares."""
     theta = problem.possible(theta)
     sizes = problem.sizes(theta)
     flown = problem.flown(theta)
@@ -255,16 +244,16 @@ def linearise(
 def _commands(
     problem: Problem, sizes: Mapping[str, float], windows: Sequence[Window]
 ) -> list[ndarray]:
-    """Return the change of each window by each command that did not come, shape (N, T) each."""
+    """Return the change of each window if a command is lost, shape (N, T) each."""
     commands = []
     for change, window in zip(problem.model.without_commands(sizes, problem.kept), windows):
-        behind = len(window.residual) - len(change)  # nothing behind replayed samples
+        behind = len(window.residual) - len(change)  # direct measurements do not change
         commands.append(np.pad(change, ((0, behind), (0, 0))))
     return commands
 
 
 def _clean(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window], list[Gram]]:
-    """Return windows in which outliers weigh less, and their inner products."""
+    """Reduce the weight of outliers in windows; return the windows and their inner products."""
     floors = problem.priors.floor
     channels = len(problem.model.channels)
     grams = grams_of(windows, floors, channels)
@@ -276,7 +265,7 @@ def _clean(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window], l
 
 
 def with_terms(window: Window, terms: Sequence[TermEffect], theta: ndarray) -> Window:
-    """A window with terms as its last effects, about their sizes at ``theta`` (in floors)."""
+    """Append terms to the effects of a window, linearised at their sizes in ``theta`` [floors]."""
     columns = window.latent @ forces(window, terms)
     sizes = theta[-len(terms) :] * [e.floor for e in terms]
     effects = np.hstack((window.effects, columns))
@@ -284,10 +273,11 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: ndarray) -> W
 
 
 def _losing(window: Window, columns: ndarray, lost: ndarray) -> Window:
-    """A window some of whose commands did not come: the expected part of each, and its deviation
-    among what nobody knows.
+    """Return a window some of whose commands may be lost: their mean effect is subtracted, and the
+    uncertainty of each becomes a nuisance.
 
-    ``lost``: probability of each command that it did not come, shape (T,)."""
+    ``columns``: change by each command, shape (N, T); ``lost``: probability of each that it was
+    lost, shape (T,)."""
     sd = np.append(window.nuisance_sd, np.sqrt(lost * (1.0 - lost)))
     nuisance = np.hstack((window.nuisance, columns))
     residual = window.residual - columns @ lost
@@ -297,14 +287,14 @@ def _losing(window: Window, columns: ndarray, lost: ndarray) -> Window:
 def statistics_of(
     point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Sequence[int]
 ) -> Statistics:
-    """Return the statistics of windows, with those of T further columns behind those of the
-    effects; windows of fewer have columns of 0.
+    """Return the statistics of windows with further columns after those of the effects; windows
+    with fewer columns are padded with 0.
 
     Args:
-        point: whose noise levels are taken.
+        point: gives the noise levels.
         windows: with residuals at the point.
         columns: of each window, shape (N, T).
-        rows: numbers of the windows among the point's.
+        rows: indices of the windows among the point's.
     """
     longest = max(changes.shape[1] for changes in columns)
     wide = []
@@ -321,7 +311,7 @@ def statistics_of(
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
-    """Return a point of some of its windows, with noise levels estimated from these."""
+    """Return the point with some of its windows, and noise levels estimated from these."""
     grams = [point.grams[w] for w in windows]
     noise = levels.maximised(grams, levels.only(point.noise, grams, windows))[0]
     kept = [point.windows[w] for w in windows]
@@ -333,16 +323,16 @@ def only(point: Point, windows: Sequence[int]) -> Point:
 
 
 def untracked_windows(point: Point) -> list[int]:
-    """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope
-    that whips beyond prediction.
+    """Return the indices of windows that the simulation does not follow under any latent forces,
+    such as a crash or an unpredictably whipping rope.
 
-    What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
-    lost, but something is missing."""
+    Their derivatives are meaningless, so they carry no information on effects. If there are many,
+    an effect is missing instead, and none is returned."""
     statistics = point.integrals.statistics(with_shares(point, point.theta), point.theta)
     squares = statistics.square - point.integrals.log_dets
     misfit = squares / np.maximum(statistics.samples, 1.0)
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    # what an unknown motion does is no effect's doing
+    # after an unknown motion, a smaller misfit suffices
     limit = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)
     distant = np.flatnonzero(misfit > np.where(shaken, limit, UNKNOWN_RATIO))
     if len(distant) > LOST_SHARE * len(misfit):
@@ -351,13 +341,13 @@ def untracked_windows(point: Point) -> list[int]:
 
 
 def moved(point: Point, theta: ndarray) -> Point | None:
-    """Simulate at ``theta``, with the same kinds of blocks, but keep the derivatives and noise
-    levels of ``point``; None where the simulation fails there.
+    """Simulate at ``theta`` with the same kinds of blocks, and keep the derivatives and noise
+    levels of ``point``; None if the simulation fails.
     """
     problem = point.problem
     theta = problem.possible(theta)
     flown = problem.flown(theta)
-    count = len(problem.model.effects)  # a term's column stays that of where derivatives were taken
+    count = len(problem.model.effects)  # columns of terms are not taken anew
     sizes = problem.priors.floor[count:] * theta[count:] * (flown is None)
     simulated = (flown or problem.model).residuals(problem.sizes(theta), point.about)
     residuals = []
@@ -380,8 +370,8 @@ def moved(point: Point, theta: ndarray) -> Point | None:
 
 
 def curvature(origin: Point, moved_point: Point) -> float:
-    """Return the largest size of any effect that the simulation's distance from its linearisation
-    would be taken for while none is named, in floors.
+    """Express the linearisation error by effects: return the largest size that any effect would get
+    from the difference of simulation and linearisation, in floors.
 
     ``origin``: where the derivatives were taken; ``moved_point``: a point moved from it, with the
     same derivatives."""
@@ -397,26 +387,25 @@ def curvature(origin: Point, moved_point: Point) -> float:
 
 
 def with_floors_noise(point: Point, active: Sequence[int]) -> Point:
-    """Return the point with the noise levels that remain when every effect has its most probable
-    size, those not named below their floors.
+    """Return the point with noise levels estimated with every effect at its posterior mean, where
+    effects that are not selected stay below their floors.
 
-    What a dozen effects below their floors leave is no gust, but it is nothing that is missing
-    either; nor is what an effect that varies has of its own in each flight. ``point``: whose
-    derivatives and residuals are taken."""
+    So neither the sum of a dozen negligible effects nor random shares raise the levels. ``point``:
+    gives derivatives and residuals."""
     return with_noise_at(point, point.posterior.mean(active))
 
 
 def with_noise_at(point: Point, theta: ndarray) -> Point:
-    """Return the point with noise levels estimated from the residuals at ``theta``, and each
-    flight's random shares beside it.
+    """Return the point with noise levels estimated from the residuals at ``theta`` plus each
+    flight's random shares.
     """
     grams = with_shares(point, theta)
     return regathered(point, noise=levels.maximised(grams, point.noise)[0])
 
 
 def with_shares(point: Point, theta: ndarray) -> list[Gram]:
-    """Return the inner products of a point's windows at ``theta``, and with each flight's random
-    shares beside it.
+    """Return the inner products of a point's windows at ``theta`` plus each flight's random
+    shares.
     """
     shares = estimate_shares(point.plain, theta, point.shares) + theta - point.theta
     if not shares.any():
@@ -426,7 +415,7 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
 
 
 def shifted(gram: Gram, change: ndarray) -> Gram:
-    """Inner products of r - S change."""
+    """Return the inner products with the residual r - S change in place of r."""
     begin = gram.hidden
     part = gram.inner[:, :, begin:] @ change
     mixed = gram.cross[:, begin:] @ change
@@ -435,11 +424,11 @@ def shifted(gram: Gram, change: ndarray) -> Gram:
 
 
 def fitted(point: Point, active: Sequence[int]) -> Point:
-    """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step
-    that does not help is halved.
+    """Fit the sizes of effects by Gauss-Newton steps, with fixed derivatives and simulated
+    residuals; a step that does not lower the misfit is halved.
 
-    ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to
-    0."""
+    ``point``: where the derivatives were taken; ``active``: effects that are fitted; all others
+    become 0."""
     named = np.isin(np.arange(len(point.theta)), list(active))
     best: Point | None = point
     if np.any(point.theta[~named] != 0.0):
@@ -449,7 +438,7 @@ def fitted(point: Point, active: Sequence[int]) -> Point:
     kinds = point.problem.switches
     for _ in range(ROUNDS):
         goal = best.posterior.estimate(active)
-        goal[kinds] = best.theta[kinds]  # no step turns a block into another
+        goal[kinds] = best.theta[kinds]  # steps do not switch blocks
         trial = _step(best, goal)
         if trial is None:
             break
@@ -460,8 +449,8 @@ def fitted(point: Point, active: Sequence[int]) -> Point:
 
 
 def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) -> float:
-    """Nats that another step of these effects' sizes would bring by the derivatives, no block
-    turned into another; ``switches``: of blocks of another kind as well, to another part of them.
+    """Return the gain that another step of these effects' sizes promises [nats]; ``switches``:
+    whether switches take part in it.
     """
     remaining = point.posterior.estimate(active) - point.theta
     if not switches:
@@ -470,10 +459,11 @@ def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) 
 
 
 def _step(point: Point, goal: ndarray) -> Point | None:
-    """The largest part of a step that fits better; None where there is none.
+    """Return the point after the largest part of a step that lowers the misfit; None if no part
+    does.
 
-    Shorter steps are tried however much a longer one fails: the simulation may lose a window
-    beyond some size."""
+    Shorter steps are tried even if a longer one fails badly: beyond some size, the simulation may
+    lose a window."""
     share = 1.0
     while share > 0.1:
         change = share * (goal - point.theta)
@@ -492,10 +482,10 @@ def _misfit(point: Point) -> float:
 
 
 def candidate(point: Point, active: Sequence[int]) -> Point:
-    """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first
-    goes over to the sizes.
+    """Fit the sizes of a set and the noise levels alternately: what counted as gusts at first is
+    gradually explained by the sizes.
 
-    ``point``: whose derivatives and noise levels it begins with, and whose kinds of blocks.
+    ``point``: gives derivatives, initial noise levels and kinds of blocks.
     """
     point = fitted(point, active)
     point = with_noise_at(point, point.theta)

@@ -1,11 +1,10 @@
-"""Terms of laws outside the catalogue, as further effects of a model.
+"""Screen terms of laws that the catalogue does not contain, and offer the best as further effects.
 
-The column of a term is G A v: G are the derivatives by the latent forces, A the latent forces that
-anything exerted at the knots stands for, v the term's values there. So thousands of terms are
-screened at once without a simulation: a window needs A' G' V^-1 G A alone, with V as in
-:mod:`visthrow.diagnose.likelihood.marginal`, and all terms are a product of tables. The best become
-effects of the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like
-any other."""
+The column of a term is G A v, with the derivatives G by the latent forces, the matrix A from forces
+at the knots to latent forces, and the term's values v at the knots. So thousands of terms are
+screened without a simulation: each window needs A' G' V^-1 G A only, with V as in
+:mod:`visthrow.diagnose.likelihood.marginal`. The best terms become effects of the problem
+(:attr:`visthrow.diagnose.select.point.Problem.terms`), and are selected like any other effect."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -43,34 +42,31 @@ from visthrow.diagnose.select.point import Point, regathered, with_shares, with_
 from visthrow.diagnose.select.result import Law
 
 LAW = 2.0 * STRONG
-"""Nats by which a term must be ahead where it takes the place of no name, and which a name costs
-more where a law acts.
+"""Evidence beyond every single effect that a term needs, and additional penalty of an effect in a
+block in which a law acts [nats].
 """
 
 NARROW = 1e-3
-"""Floor of a term in its prior deviation: a term is there or it is not; the usual deviation of a
-name in that of one of any size.
-"""
+"""Floor of a term, relative to its prior deviation: a term is practically present or absent."""
 
-SAME = 1e-9  # share of a term's information from which what a cause leaves of it is rounding
+SAME = 1e-9  # smallest share of a term's information that is not rounding
 
 PIECES = 7
-"""Places between which a curve is linear: enough to distinguish a step from a line. With 5 or 9 the
-evidence is the same within a few nats.
+"""Points between which a curve is linear: enough to distinguish a step from a line. With 5 or 9,
+the evidence differs by a few nats.
 """
 
-OUTER = 1.0, 99.0  # percentiles of what was flown, between which the places lie
-LEAST_REACH = 1e-6  # span of the places of a scalar that never changes: its curve is a constant
+OUTER = 1.0, 99.0  # percentiles of a scalar between which these points lie
+LEAST_REACH = 1e-6  # span of the points of a constant scalar
 
-# terms that become effects to be weighed: as many as other sets that are simulated in their place
-WEIGHED = 6
+WEIGHED = 6  # terms that are offered as effects at once
 
 
 @dataclass
 class Screen:
-    """Information of all terms, or curves, about one point, summed over windows.
+    """Information and scores of all terms, or curves, at one point, summed over windows.
 
-    A term is one column of latent forces; a curve is ``m`` of them, see :func:`best_curves`."""
+    A term is one column of latent forces; a curve has ``m`` columns, see :func:`best_curves`."""
 
     terms: tuple[Term, ...]
     size: ndarray  # root mean square over the knots, shape (T,)
@@ -80,10 +76,10 @@ class Screen:
 
 
 def acts_in(laws: Iterable[str]) -> set[str]:
-    """Return the latent blocks that laws of these blocks act in.
+    """Return the latent blocks on which laws of these blocks act.
 
-    A law of the rotors or of the air turns the vehicle as well as it pushes it. In the rope's joint
-    a law acts in all blocks."""
+    A law of rotors or air exerts both force and torque. A law of the rope's joint acts on all
+    blocks."""
     blocks = set(laws)
     if JOINT in blocks:
         return set(LATENT_BLOCKS)
@@ -92,20 +88,20 @@ def acts_in(laws: Iterable[str]) -> set[str]:
 
 
 def level_block(block: str) -> str:
-    """Latent block whose levels a term's size is measured in."""
+    """Return the latent block whose level is the scale for a term's size."""
     return "vehicle torque" if block == JOINT else block
 
 
 def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
-    """The point as if no phase were much rougher than is usual in its block and each flight's
-    random shares were known, and the statistics of its windows with unit latents as further
-    effects.
+    """Limit the latent forces of each phase to a multiple of their block's median, and return the
+    point and the statistics of its windows with latents as further effects.
 
-    A force that the model lacks is taken for gusts in the phases in which it acts; there no term of
-    it would stand out."""
+    A missing force raises the level of latent forces in the phases in which it acts. Without the
+    limit, no term would stand out there. Each flight's random shares are held at their
+    estimates."""
     levels = point.noise.latent_sd
     limits = {}
-    for block in {block for block, _ in levels}:  # the least of a phase with few windows may be any
+    for block in {block for block, _ in levels}:  # not the minimum: few windows may make it small
         of_phases = [level for (b, _), level in levels.items() if b == block]
         limits[block] = UNKNOWN_RATIO * np.percentile(of_phases, 50, method="lower")
     capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
@@ -120,10 +116,10 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
 
 
 class Survey:
-    """A record of what windows say of forces at their knots beside a set of names."""
+    """Information of windows about forces at their knots, given a set of selected effects."""
 
     def __init__(self, point: Point, parts: Statistics, active: Sequence[int]):
-        """Keep a point and the statistics of its windows; ``active``: the names."""
+        """Store a point and the statistics of its windows; ``active``: the selected effects."""
         posterior = point.posterior
         self.point = point
         self.parts = parts
@@ -133,8 +129,8 @@ class Survey:
         self.mean = self.sigma @ posterior.score
 
     def screen(self, block: str, curves: bool = False) -> Screen | None:
-        """Gather what each term of a block says, or each curve; None where the windows carry no
-        knots for any.
+        """Sum up the information about each term of a block, or each curve; None if the windows
+        have no knots for it.
         """
         point = self.point
         carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
@@ -154,7 +150,9 @@ class Survey:
     def _in_window(
         self, w: int, block: str, values_of: Callable[[KnotValues], ndarray]
     ) -> tuple[ndarray, int, ndarray, ndarray, ndarray]:
-        """Square, number of knots, information, score and cross information of all terms."""
+        """Return sum of squares, number of knots, information, score and cross information of all
+        terms in a window.
+        """
         gram = self.point.grams[w]
         count = len(self.point.theta)
         latents = slice(count, count + gram.latents)
@@ -175,7 +173,7 @@ class Survey:
         return square, int(acting.sum()) // 3, information, score.reshape(terms, columns), cross
 
     def _left(self, screened: Screen) -> tuple[ndarray, ndarray]:
-        """Information and score of each term, of what the names leave."""
+        """Return information and score of each term, conditional on the selected effects."""
         cross = screened.cross
         known = np.einsum("tik,kl,tjl->tij", cross, self.sigma, cross, optimize=True)
         information = screened.information - known
@@ -184,8 +182,8 @@ class Survey:
         return information, screened.score - cross @ self.mean
 
     def gains(self, screened: Screen, reach: float) -> tuple[ndarray, ndarray]:
-        """Nats of each term beside the names, and its prior deviation, which makes it ``reach``
-        strong at the knots.
+        """Return the gain of each term beside the selected effects [nats], and its prior deviation,
+        which corresponds to ``reach`` at the knots.
         """
         information, score = self._left(screened)
         size = screened.size
@@ -199,11 +197,11 @@ class Survey:
         return gain, prior
 
     def unsaid(self, screened: Screen, causes: Sequence[int]) -> ndarray:
-        """Nats of each screened term that no single cause explains, whatever its size, beside the
-        names; shape (T,).
+        """Return the gain of each term that no single effect of any size could replace [nats],
+        shape (T,).
 
-        A term has neither bounds nor a usual size. It must not take the place of a cause that says
-        the same only because the cause lies at its bound, or is larger than was expected."""
+        Unlike effects, a term has neither bounds nor a typical size. It must not replace an
+        equivalent effect only because that effect is at its bound or unusually large."""
         information, score = self._left(screened)
         information = information[:, 0, 0]
         score = score[:, 0]
@@ -218,12 +216,14 @@ class Survey:
 
 
 def _proportional(terms: Sequence[Term], values: KnotValues) -> ndarray:
-    """Return terms as one column each, shape (k, 3, T, 1)."""
+    """Return the values of terms at the knots, one column each, shape (k, 3, T, 1)."""
     return table(terms, values)[..., None]
 
 
 def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, ndarray]:
-    """Return where a curve of each scalar may bend, evenly over what was flown, shape (m,) each."""
+    """Return the points at which a curve of each scalar may bend, evenly over its range in the
+    flights, shape (m,) each.
+    """
     places = {}
     for name in {term.factors[0] for term in terms}:
         flown = np.concatenate([SCALARS[name].read(v) for v in values])
@@ -233,9 +233,9 @@ def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, nd
 
 
 def _hats(terms: Sequence[Term], places: Mapping[str, ndarray], values: KnotValues) -> ndarray:
-    """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m).
+    """Return the values of curves, hat functions of a scalar times a vector, shape (k, 3, T, m).
 
-    ``terms``: of every scalar with every vector."""
+    ``terms``: every scalar with every vector."""
     number = np.arange(PIECES)
     vectors = VECTORS[terms[0].block]
     names = dict.fromkeys(term.vector for term in terms)
@@ -252,14 +252,13 @@ def _hats(terms: Sequence[Term], places: Mapping[str, ndarray], values: KnotValu
 def best_curves(
     point: Point, active: Sequence[int], strongest: Mapping[str, float]
 ) -> dict[str, tuple[float, str]]:
-    """Return the nats that the best curve of each block brings beside a set of names, less the log
-    of how many were tried, and its formula; none of a block that the windows carry no knots for.
+    """Return the gain of the best curve of each block beside the selected effects [nats], minus the
+    log of the number of curves, and its formula; blocks without knots are missing.
 
-    A curve is a force f(q) v along a vector v, with any function f of one scalar q: pieces that
-    are linear between ``PIECES`` places. It tells whether names have the right form. No name is
-    given up for a law that is a little better: a curve that holds no more than the names say
-    brings nothing. ``strongest``: latent force of each block where the model stood alone [N or
-    N m]; the prior deviation of f v is ``UNKNOWN_RATIO`` of it at each place."""
+    A curve is a force f(q) v along a vector v, with a function f of one scalar q that is linear
+    between ``PIECES`` points. It checks whether the selected effects have the right form: if they
+    have, no curve gains anything. ``strongest``: latent force of each block with nothing selected
+    [N or N m]; the prior deviation of f v at each point is ``UNKNOWN_RATIO`` times it."""
     if not strongest:
         return {}
     survey = Survey(*with_capped_gusts(point), active)
@@ -277,7 +276,7 @@ def best_curves(
 
 
 def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point]:
-    """Points of one problem with more terms as effects, at 0; nothing is simulated again."""
+    """Add terms of size 0 to points of one problem, without simulation."""
     problem = points[0].problem
     wide = replace(problem, terms=(*problem.terms, *terms))
     channels = len(problem.model.channels)
@@ -293,9 +292,7 @@ def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point
 
 
 def without_laws(point: Point) -> Point:
-    """The point of its problem without terms, whose shares are left out of the residuals where they
-    are not 0.
-    """
+    """Return the point without the terms of its problem; residuals stay as they are."""
     problem = point.problem
     if not problem.terms:
         return point
@@ -318,11 +315,11 @@ def shortlist(
     strongest: Mapping[str, float],
     threshold: float,
 ) -> list[TermEffect]:
-    """The terms that say most beside a set of names and what no single cause says, by the linear
-    statistics.
+    """Return the most promising terms beside a set of selected effects, by the linear statistics,
+    without those that a single effect could replace.
 
-    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
-    nats that a term must bring beyond its price."""
+    ``strongest``: latent force of each block with nothing selected [N or N m]; ``threshold``:
+    evidence that a term needs beyond its penalty [nats]."""
     problem = point.problem
     causes = np.flatnonzero(problem.priors.visible[: len(problem.model.effects)])
     survey = Survey(*with_capped_gusts(point), active)
@@ -341,7 +338,7 @@ def shortlist(
     for block, screened in screens.items():
         gain, prior = survey.gains(screened, UNKNOWN_RATIO * strongest[block])
         gain[survey.unsaid(screened, causes) < LAW] = -np.inf
-        # of terms that say the same in other words in these flights, the simplest comes first
+        # of terms that are equivalent in these flights, keep the first and simplest
         _, first = np.unique(np.round(gain, 3), return_index=True)
         for i in first:
             term = screened.terms[i]
@@ -353,8 +350,8 @@ def shortlist(
 
 
 def as_effect(term: Term, prior: float, price: float) -> TermEffect:
-    """A term as an effect, with the prior deviation of its coefficient and what it costs beyond the
-    threshold [nats].
+    """Make an effect of a term; ``prior``: standard deviation of its coefficient; ``price``:
+    penalty beyond the threshold [nats].
     """
     return TermEffect(
         term.formula,
@@ -373,8 +370,8 @@ def as_effect(term: Term, prior: float, price: float) -> TermEffect:
 
 
 def strongest_forces(point: Point) -> dict[str, float]:
-    """Latent force of each block in the phase where it is strongest [N or N m]; none where a window
-    has no knots.
+    """Return the latent force of each block in the phase in which it is strongest [N or N m]; empty
+    if a window has no knots.
     """
     strongest: dict[str, float] = {}
     for (block, _), level in point.noise.latent_sd.items():
@@ -386,7 +383,7 @@ def strongest_forces(point: Point) -> dict[str, float]:
 
 
 def moves_landing(point: Point, j: int) -> bool:
-    """Whether an effect moves a position by ``LANDING`` within the median window of a phase."""
+    """Return whether an effect moves a position by ``LANDING`` in the median window of a phase."""
     positions = positions_of(point)
     size = point.theta[j] * point.problem.priors.floor[j]
     moves: dict[str, list[float]] = {}
@@ -398,7 +395,7 @@ def moves_landing(point: Point, j: int) -> bool:
 
 
 def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
-    """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
+    """Return the terms of a set with their coefficients and deviations; ``nats``: their gain."""
     sigma = point.posterior.covariance(active)
     mean = sigma @ point.posterior.score
     effects = point.problem.effects
