@@ -1,4 +1,4 @@
-"""Say what a model gets wrong: prepare the flights, select causes, judge them."""
+"""Diagnose a model by measured flights: check the flights, select effects, judge them."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -45,20 +45,20 @@ def diagnose(
     laws: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Say what a model gets wrong about flights: check, select, validate, conclude.
+    """Find what a model gets wrong about flights: check, select, validate, conclude.
 
     Args:
-        flights: logs of what was measured.
-        model: a simulation of these flights with its catalogue of effects, or what builds it; it is
-            asked for once the logs were checked.
-        vehicle: of the vehicle, for the checks.
-        seed: of the null worlds that the threshold is calibrated on.
-        without: numbers of flights that are left out.
-        laws: whether to look for laws outside the catalogue.
-        progress: called with a line at each step.
+        flights: logs of measurements.
+        model: a simulation of these flights with its catalogue of effects, or a function that
+            builds it, which is called after the logs were checked.
+        vehicle: known facts about the vehicle, for the checks.
+        seed: of the null worlds by which the threshold is calibrated.
+        without: indices of flights that are left out.
+        laws: whether to search for laws outside the catalogue.
+        progress: called with a line of text at each step.
 
-    Returns one verdict for every effect, and one overall. Raises DiagnoseError: the model gives no
-    window, or contradicts itself."""
+    Returns a verdict for every effect, and an overall one. Raises DiagnoseError: the model returns
+    no window or invalid ones."""
     say = progress or (lambda _: None)
     checked = check(flights, vehicle)
     refused = refused_of(checked, vehicle)
@@ -98,9 +98,7 @@ def diagnose(
 def refused_of(
     checked: Sequence[Checked], vehicle: KnownVehicle = UNKNOWN_VEHICLE
 ) -> tuple[int, ...]:
-    """Return the numbers of logs whose channels, of those that a model reads, contradict each
-    other.
-    """
+    """Return the indices of logs in which channels that the model reads contradict each other."""
     return tuple(i for i, log in enumerate(checked) if contradictions([log], vehicle.unread))
 
 
@@ -112,12 +110,9 @@ def explain(
     laws: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
-    """Say what the model gets wrong about its flights.
+    """Find what the model gets wrong about its flights, without checking the logs.
 
-    ``model``: a simulation of measured flights with its catalogue of effects; ``seed``: of the null
-    worlds that the threshold is calibrated on; ``laws``: whether to look for laws outside the
-    catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
-    Raises DiagnoseError: the model gives no window, or contradicts itself."""
+    Arguments, result and errors are those of :func:`diagnose`."""
     begun = time.monotonic()
     say = progress or (lambda _: None)
     windows = model.windows({})
@@ -150,11 +145,11 @@ def explain(
 def _search(
     nominal: Point, seed: int, say: Callable[[str], None], laws: bool
 ) -> tuple[Selector, Scatter | None]:
-    """Select causes of the windows that the simulation follows, and lost commands."""
+    """Select effects and lost commands, and drop windows that the simulation does not follow."""
     begin = NOTHING
     priors = nominal.problem.priors
     for further in range(2 * ROUNDS, -1, -1):
-        untracked = untracked_windows(nominal) if further else []  # the worst hide others
+        untracked = untracked_windows(nominal) if further else []  # bad ones may hide others
         if not untracked:
             needed = threshold(nominal.statistics, priors, np.random.default_rng(seed))
             count = f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights"
@@ -170,8 +165,8 @@ def _search(
 
 
 def _find_unfollowed(selection: Selector) -> list[int]:
-    """Return windows that the simulation does not follow with the causes, at their sizes or where
-    the derivatives would have them.
+    """Return the windows that the simulation does not follow with the selected effects, at their
+    sizes or at those predicted by the derivatives.
     """
     point = selection.best.point
     goal = point.posterior.estimate(selection.best.columns)
@@ -184,9 +179,9 @@ def _find_unfollowed(selection: Selector) -> list[int]:
 
 
 def _select(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
-    """Select, and select again as if commands had got lost, where that may say more.
+    """Run the selection, and repeat it with lost commands if these may explain more.
 
-    Lost commands are a candidate that needs a linearisation of its own."""
+    Lost commands are a candidate that needs another linearisation."""
     plain = selector.run(begin)
     nominal = plain.nominal
     needed = plain.threshold
@@ -210,11 +205,10 @@ def _select(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]
 def correct_interface_mistakes(
     logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog]], Model]
 ) -> tuple[Model, list[FlightLog]]:
-    """A model of logs whose commands are as the simulation takes them: without each suspected
-    mistake that does not earn its price.
+    """Correct mistakes in the commands of logs, if their evidence exceeds their penalty.
 
-    ``plant``: that the commands are for; ``build``: makes a model of logs.
-    Returns the model, which names what was put right as its ``mistakes``, and its logs.
+    ``plant``: plant for which the commands are; ``build``: makes a model of logs. Returns the
+    model, which lists the corrections as its ``mistakes``, and its logs.
     """
     corrected, certain = interface.commanded(logs, plant)
     suspected_mistakes = interface.suspected(corrected, plant)
@@ -230,7 +224,7 @@ def correct_interface_mistakes(
         remaining = [k for k in suspected_mistakes if k is not mistake]
         try:
             alternative = built(remaining)
-        except DiagnoseError:  # no flight can be replayed without it
+        except DiagnoseError:  # no flight can be replayed without this correction
             continue
         nats = log_bayes_factor(current[0], alternative[0])
         if nats > VERY_STRONG + np.log(mistake.ways):
@@ -245,8 +239,8 @@ def correct_interface_mistakes(
 
 
 def log_bayes_factor(model: Model, rival: Model) -> float:
-    """Nats by which a model explains the windows that it shares with another better, nothing named
-    in either.
+    """Return the log Bayes factor of a model against a rival, from the windows of both and with no
+    effect selected in either.
     """
     windows = [m.windows({}) for m in (model, rival)]
     places = [
@@ -255,7 +249,7 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
     ]
     shared = sorted(places[0].keys() & places[1].keys())
     followed, rival_followed = (2 * len(n) >= len(of) for n, of in zip(places, windows))
-    if not rival_followed or not shared:  # the other fails in most
+    if not rival_followed or not shared:  # the rival fails in most of its windows
         return np.inf if followed else -np.inf
     values = []
     for m, of_model, number in zip((model, rival), windows, places):

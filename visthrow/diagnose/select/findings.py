@@ -13,13 +13,13 @@ from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Finding
 
 BIT = 0.5
-"""Flights say less than a bit about an effect whose posterior deviation exceeds this share of its
-prior's.
+"""If the posterior deviation of an effect exceeds this share of its prior's, the flights carry less
+than one bit of information about it.
 """
 
 
 def blank(effect: Effect) -> Finding:
-    """Return the finding on an effect before any flight."""
+    """Return the finding on an effect without any flight."""
     return Finding(
         effect.name,
         result.UNOBSERVABLE,
@@ -37,7 +37,7 @@ def blank(effect: Effect) -> Finding:
 
 
 def _unobservable(effect: Effect, channels: Sequence[str]) -> Finding:
-    """Return the finding on an effect of which channels are missing."""
+    """Return the finding on an effect whose channels are missing."""
     missing = tuple(c for c in effect.channels if c not in channels)
     sentence = f"{effect.name}: not observable without {', '.join(missing)}."
     return replace(blank(effect), missing=missing, sentence=sentence)
@@ -45,14 +45,14 @@ def _unobservable(effect: Effect, channels: Sequence[str]) -> Finding:
 
 @dataclass(frozen=True)
 class Reading:
-    """The flights' information and the selected sets, from which each verdict follows."""
+    """The flights' information and the possible sets, from which each verdict follows."""
 
     point: Point  # with random shares integrated out
-    active: Sequence[int]  # effects that are named
-    withdrawn: set[int]  # those whose names were withdrawn
-    sets: Sets  # with the random shares of the best
-    all_sets: Sets  # each with the effects that vary among flights in it
-    unlike: float  # variance among flights, in what is allowed
+    active: Sequence[int]  # selected effects
+    withdrawn: set[int]  # effects that were selected, but do not have the right form
+    sets: Sets  # possible sets with the random shares of the best one
+    all_sets: Sets  # all possible sets, including their effects that vary between flights
+    unlike: float  # variance between flights, relative to the tolerated one
 
     def finding(self, j: int) -> Finding:
         """Return the verdict on an effect."""
@@ -103,10 +103,10 @@ class Reading:
         return replace(finding, sentence=text)
 
     def _class_of(self, j: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the partners of an effect, and the set that it belongs to: the best, or another
-        that explains the flights as well.
+        """Return the partners of an effect in its class, and the set that contains it: the best
+        one, or another that explains the flights as well.
 
-        Partners are a named effect and the new ones of its rivals.
+        A class consists of a selected effect and the additional effects of sets without it.
         """
         active = self.active
         for home in active:
@@ -119,7 +119,7 @@ class Reading:
         return (), tuple(active)
 
     def _rivals(self, home: int) -> list[tuple[int, ...]]:
-        """Return the sets that do without an effect, of any size, unless a part of one is likelier.
+        """Return the sets without an effect, except those of which a subset is likelier.
 
         Source: Madigan and Raftery 1994, the second principle of Occam's window.
         """
@@ -132,8 +132,8 @@ class Reading:
         return rivals
 
     def _odds_of_none(self, members: Sequence[int]) -> float:
-        """Return the odds of all sets that hold none of these effects against those that hold one,
-        with the window's sets alone in question.
+        """Return the odds of the possible sets without any of these effects against those with
+        one.
         """
         with_one = 0.0
         without = 0.0
@@ -146,8 +146,8 @@ class Reading:
         return without / with_one
 
     def _named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
-        """Return the verdict on a cause that the flights ask for; ``mean`` is in floors,
-        ``members`` are those of its class.
+        """Return the verdict on a selected effect; ``mean``: in floors; ``members``: of its
+        class.
         """
         bounds = finding.low, finding.high
         size = float(np.clip(mean * finding.floor, *bounds)) + 0.0  # no -0
@@ -187,8 +187,8 @@ class Reading:
         return replace(finding, verdict=result.CLASS, sentence=sentence)
 
     def _joint(self, members: list[int]) -> str:
-        """Return the best known combination of a class: first eigenvector of its members'
-        information in prior deviations.
+        """Describe the best determined combination of a class: the first eigenvector of its
+        members' information, in units of prior deviations.
         """
         posterior = self.point.posterior
         problem = self.point.problem

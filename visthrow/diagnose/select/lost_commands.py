@@ -1,14 +1,14 @@
-"""Commands that got lost: each came, or did not with probability theta.
+"""Lost commands: each command is lost with probability theta.
 
-A window shows C m, with C the change of its samples by each command that did not come, and m 0 or 1
-for each. What the windows say of theta is the sum over all cases of m. It is bounded from below by
-probabilities q that are independent from command to command (mean field):
+A loss changes a window's samples by C m, where C has a column for each command, and m is 1 for a
+lost command and 0 for another. The likelihood of theta is a sum over all m. A mean-field
+approximation with independent probabilities q is a lower bound:
 
     log p(r) >= log p(r | m = q) - 1/2 sum I_kk q_k (1 - q_k) - sum KL(q_k | theta)
 
-with information I on the commands. A command that surely came costs -log(1 - theta), however
-clearly it did. Windows of a problem with :attr:`visthrow.diagnose.select.point.Problem.lost`
-probabilities differ by C q, and have the rest of C m among what is not known of them.
+with information I on the commands. A command that was surely received costs -log(1 - theta). In a
+problem with probabilities :attr:`visthrow.diagnose.select.point.Problem.lost`, windows are
+corrected by C q, and the uncertainty of C m is one of their nuisances.
 
 Source: Jordan, Ghahramani, Jaakkola and Saul 1999, section 6 (mean field as a lower bound)."""
 
@@ -38,15 +38,16 @@ from visthrow.diagnose.select.point import ROUNDS, Point, statistics_of
 NAME = "dropped_commands"  # of the random effect in the catalogue
 
 EITHER = 0.5
-"""Mean and deviation of m where either is as likely.
+"""Mean and standard deviation of m if both values are equally likely.
 
-From half of it as a deviation 0 and 1 are told apart: half way is two from both.
+With half of it as posterior deviation, 0 and 1 are distinguished: the middle is two deviations from
+both.
 """
 
 
 def _assume_lost(statistics: Statistics, effects: int, lost: ndarray) -> Statistics:
-    """Return what windows say of the effects if so much of each command did not come, shape
-    (W, T).
+    """Return the statistics of the effects, given how much of each command is lost, shape (W,
+    T).
     """
     theta = np.tile(statistics.theta, (len(lost), 1))
     theta[:, effects:] = lost
@@ -54,18 +55,23 @@ def _assume_lost(statistics: Statistics, effects: int, lost: ndarray) -> Statist
 
 
 def divergence(lost: ndarray, share: float) -> float:
-    """Return the nats that probabilities cost which differ from the share of all commands."""
+    """Return the sum of KL divergences of each command's probability from the common share
+    [nats].
+    """
     odds = xlogy(lost, share) + xlog1py(1.0 - lost, -share)
     return -float((entr(lost) + entr(1.0 - lost) + odds).sum())
 
 
 def _improve(score: ndarray, information: ndarray, share: float, lost: ndarray) -> ndarray:
-    """Return the probabilities that commands did not come, from a guess on, by what each window
-    gains most from until all that is left is worth little.
+    """Maximise the bound over the probabilities that commands were lost, by coordinate ascent.
+
+    In each step, every window updates the probability with the largest gain, until no gain matters.
 
     Args:
-        score: of the commands where none was lost, shape (W, T).
-        information: on them, shape (W, T, T).
+        score: of the commands if none is lost, shape (W, T).
+        information: on the commands, shape (W, T, T).
+        share: of lost commands.
+        lost: first guess of the probabilities, shape (W, T).
     """
     lost = lost.copy()
     diagonal = information.diagonal(axis1=1, axis2=2)
@@ -90,8 +96,8 @@ def _improve(score: ndarray, information: ndarray, share: float, lost: ndarray) 
 def _bound_evidence(
     statistics: Statistics, priors: Priors, named: Sequence[int], share: float, lost: ndarray
 ) -> tuple[float, ndarray]:
-    """Return log Z of a set of effects where that share of the commands did not come, as a bound
-    from below, and the probability of each; ``lost``: a guess of these, shape (W, T).
+    """Return a lower bound of log Z of a set of effects for a share of lost commands, and the
+    probability of each command; ``lost``: a guess of these, shape (W, T).
     """
     effects = len(priors.floor)
     information = statistics.information[:, effects:, effects:]
@@ -112,8 +118,8 @@ def _bound_evidence(
 def _profile(
     statistics: Statistics, priors: Priors, named: Sequence[int], shares: ndarray
 ) -> tuple[ndarray, list[ndarray]]:
-    """Return the nats by which each share of lost commands explains windows better than none, with
-    a set of effects, and the probabilities of each; ``shares``: from small to large.
+    """Return the gain of each share of lost commands over none, with a set of effects [nats], and
+    the probabilities of the commands at each; ``shares``: ascending.
     """
     effects = len(priors.floor)
     none = np.zeros_like(statistics.score[:, effects:])
@@ -123,7 +129,7 @@ def _profile(
     guess = np.full_like(none, shares[0])
     odds = logit(shares)
     for i, share in enumerate(shares.tolist()):
-        if i:  # as if each command were alone
+        if i:  # move the guess by the change of the prior odds
             guess = expit(logit(guess) + odds[i] - odds[i - 1])
         value, guess = _bound_evidence(statistics, priors, named, share, guess)
         nats.append(value - plain)
@@ -132,8 +138,8 @@ def _profile(
 
 
 def _with_size(scatter: Scatter, information: ndarray, lost: ndarray) -> Scatter:
-    """Return the verdict with the share of those commands of which a window tells by itself whether
-    they came, with Jeffreys' interval; ``information``: on all commands, shape (W, T, T).
+    """Return the verdict with the share of lost ones among the commands that can be classified, and
+    Jeffreys' interval of it; ``information``: on all commands, shape (W, T, T).
     """
     spread = np.linalg.inv(information + np.eye(lost.shape[1]) / EITHER**2)
     clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
@@ -147,8 +153,8 @@ def _with_size(scatter: Scatter, information: ndarray, lost: ndarray) -> Scatter
 
 
 def _least_explained(point: Point) -> list[int]:
-    """Return the numbers of the windows with the largest errors for their noise: one lost command
-    shows in its window alone.
+    """Return the indices of the windows with the largest errors relative to their noise. A lost
+    command shows in its window alone.
     """
     errors = []
     for window in point.windows:
@@ -160,10 +166,10 @@ def _least_explained(point: Point) -> list[int]:
 def verdict(
     point: Point, active: Sequence[int], threshold: float
 ) -> tuple[Scatter, tuple[ndarray, ...]] | None:
-    """Whether commands got lost, beside a set of effects or any that are still missing, and the
-    probability of each command of each window; None where none was, or a model cannot tell.
+    """Judge whether commands were lost, both beside a set of effects and beside all effects.
 
-    ``threshold``: nats that a finding needs.
+    ``threshold``: evidence that a finding needs [nats]. Returns the verdict and the probability of
+    each command of each window; None if no share gains anything, or the model cannot tell.
     """
     v = next(v for v in random_effects() if v.name == NAME)
     problem = point.problem

@@ -1,6 +1,7 @@
-"""What a diagnosis says: one verdict for every effect, one overall, and the way that led there.
+"""The result of a diagnosis: a verdict on every effect, an overall verdict, and how they came
+about.
 
-Plain data, ready for JSON.
+It is plain data, ready for JSON.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ FOUND = "FOUND"
 CLASS = "CLASS"
 BOUNDED = "BOUNDED"
 CANDIDATE = "CANDIDATE"
-NAMED = (FOUND, CLASS, CANDIDATE)  # verdicts on effects that the flights ask for
+NAMED = (FOUND, CLASS, CANDIDATE)  # verdicts on selected effects
 NOT_IDENTIFIABLE = "NOT IDENTIFIABLE"
 UNOBSERVABLE = "UNOBSERVABLE"
 VERDICTS = {
@@ -67,24 +68,24 @@ class Finding:
     cause: str
     equation: str
     unit: str
-    # size with all other effects free below their floors; of a class's member if it is the cause;
-    # else 0 [unit]
+    # size with all other effects free below their floors; for a member of a class, if it is the
+    # cause; otherwise 0 [unit]
     estimate: float
-    sd: float  # likewise, of these flights, and what numerics add [unit]
+    sd: float  # standard deviation of the size in these flights, with numerical error [unit]
     low: float  # 95 % interval [unit]
     high: float
     floor: float  # [unit]
-    nats: float  # by which naming it raises the evidence
+    nats: float  # gain in evidence by selecting it
     partners: tuple[str, ...] = ()  # other members of its class
-    joint: str = ""  # the combination of a class that is known
+    joint: str = ""  # the combination of a class's sizes that is determined
     missing: tuple[str, ...] = ()  # channels that would show it
-    manoeuvres: tuple[str, ...] = ()  # that would separate or show it
+    manoeuvres: tuple[str, ...] = ()  # that would show it or separate it from its class
     sentence: str = ""
-    differs: float = 0.0  # deviation by which another flight may differ from these [unit]
+    differs: float = 0.0  # standard deviation between these flights and another [unit]
 
 
 def bounded(finding: Finding) -> Finding:
-    """Return the finding as a bound on an effect that need not exist."""
+    """Turn a finding into a bound on an effect that need not be present."""
     unit = unit_suffix(finding.unit)
     limits = f"{finding.low:.3g} and {finding.high:.3g}{unit}"
     sentence = f"{finding.name}: between {limits}, if present at all."
@@ -93,40 +94,37 @@ def bounded(finding: Finding) -> Finding:
 
 @dataclass(frozen=True)
 class SelectionStep:
-    """One addition of the search, of one cause or of several at once, or an exchange of all names
-    for a set that says more.
-    """
+    """One step of the search to a better set."""
 
-    named: str  # names of a set with commas between them
-    nats: float  # against what was named before; a step gains more than ENOUGH_NATS
-    screened: Mapping[str, float]  # effect or set -> nats by the linear statistics, best first
-    refitted: Mapping[str, float]  # effect or set -> nats with the simulation run again
+    named: str  # names of the set, separated by commas
+    nats: float  # gain over the previous set, more than ENOUGH_NATS
+    screened: Mapping[str, float]  # set -> gain by the linear statistics, best first
+    refitted: Mapping[str, float]  # set -> gain by simulation
 
 
 @dataclass(frozen=True)
 class Level:
-    """Latent force of one block in one phase: what moved the vehicle besides the model."""
+    """Standard deviation of the latent force on one block in one phase [N or N m]."""
 
     block: str
     phase: str
-    before: float  # with the model as it stands [N or N m]
-    after: float  # with what was named
-    quiet: float  # of the quietest phase, afterwards
-    nats: float  # against its being as low as that times UNKNOWN_RATIO
+    before: float  # with nothing selected
+    after: float  # with the selected effects
+    quiet: float  # upper limit in the quietest phase, with the selected effects
+    nats: float  # evidence that it exceeds UNKNOWN_RATIO times that
     excessive: bool
 
 
 @dataclass(frozen=True)
 class Law(LawParams):
-    """A law outside the catalogue, as it was found."""
+    """A law outside the catalogue, with its estimated coefficient."""
 
     formula: str
     sd: float  # of the coefficient
     unit: str
-    nats: float  # of evidence, less the log of the number of terms tried
-    covariance: tuple[
-        float, ...
-    ] = ()  # of its coefficient with those of all laws of its explanation, in their order
+    nats: float  # evidence, minus the log of the number of terms tried
+    # of its coefficient with those of all laws of its explanation, in their order
+    covariance: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -137,17 +135,17 @@ class ChannelGain:
     unit: str
     before: float
     after: float
-    floor: float  # of sensor noise and of the initial state's uncertainty
-    blackbox: float  # NaN where none can be, or was, trained
+    floor: float  # error expected from sensor noise and the initial state's uncertainty
+    blackbox: float  # NaN if no black box was trained
     gain: float  # 1 - after / before
-    low: float  # 95 % interval of the gain, by the scatter of flights; NaN where one has all
+    low: float  # 95 % interval of the gain from the scatter of flights; NaN for a single flight
     high: float
     # horizon [s], before, after, floor, in sigmas
     horizons: tuple[tuple[float, float, float, float], ...]
 
     @property
     def interval(self) -> str:
-        """Return the interval in per cent as text; a single flight with the channel gives none."""
+        """Return the interval in per cent as text; a single flight has none."""
         if isnan(self.low):
             return "[no interval]"
         low, high = (round(100.0 * share, 0) + 0.0 for share in (self.low, self.high))  # no -0
@@ -156,63 +154,54 @@ class ChannelGain:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The judgement of held-out flights on a set of names."""
+    """The result of held-out flights for a set of selected effects."""
 
-    # what the names brought there, of the nats that they promise: 1 as promised, 0 nothing
-    share: float
+    share: float  # gain in evidence there, relative to the predicted one
     low: float  # 95 % interval of the share
     high: float
     channels: tuple[ChannelGain, ...]
-    named_in: Mapping[str, float] = field(
-        default_factory=dict
-    )  # effect -> share of folds that named it
+    # effect -> share of folds that selected it
+    named_in: Mapping[str, float] = field(default_factory=dict)
     folds: int = 0
     left_out: str = "flights"  # or "parts of flights"
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer.
+    """A whole diagnosis.
 
-    ``work`` holds what report, gain, plan and blind calculate with, and is not written to JSON.
+    ``work`` is for the calculations of report, gain, plan and blind, and is not written to JSON.
     """
 
     overall: str
     block: str  # of an unknown effect, else empty
     reasons: tuple[str, ...]  # for the overall verdict
-    findings: tuple[Finding, ...]  # one an effect, in the model's order
-    # what to set in the model: the findings' sizes of named effects, one of each class
+    findings: tuple[Finding, ...]  # one for each effect, in the model's order
+    # sizes to be set in the model: those of selected effects, one of each class
     theta: Mapping[str, float]
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
     steps: tuple[SelectionStep, ...] = ()
-    sets: tuple[
-        tuple[tuple[str, ...], float], ...
-    ] = ()  # sets of causes within 3 nats of the best, with their distance
+    # sets of effects within 3 nats of the best, with their distance
+    sets: tuple[tuple[tuple[str, ...], float], ...] = ()
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
-    events: tuple[int, ...] = ()  # flights in which something happened once
-    # by how much effects of a single flight differ there, as "thrust_gain in flight 3"
+    events: tuple[int, ...] = ()  # flights in which something unusual happened
+    # deviations of effects in a single flight, by names such as "thrust_gain in flight 3"
     alone: dict[str, float] = field(default_factory=dict)
-    duplicates: Mapping[int, int] = field(
-        default_factory=dict
-    )  # flight -> the earlier flight that it repeats
-    sensor_scale: Mapping[str, float] = field(
-        default_factory=dict
-    )  # channel -> noise found, in that stated
+    duplicates: Mapping[int, int] = field(default_factory=dict)  # flight -> earlier equal flight
+    # channel -> estimated noise relative to the stated one
+    sensor_scale: Mapping[str, float] = field(default_factory=dict)
     flights: int = 0
     windows: int = 0
     samples: int = 0
     seconds: float = 0.0
     seed: int = 0
-    scatter: tuple[Scatter, ...] = ()  # what may vary from flight to flight
-    mistakes: tuple[
-        Mistake, ...
-    ] = ()  # of the logs' interface, put right before anything was estimated
-    explanations: tuple[
-        tuple[Law, ...], ...
-    ] = ()  # terms that belong together, one such set in place of another, best first
-    held_out: HeldOut | None = None  # where something was named
+    scatter: tuple[Scatter, ...] = ()  # verdicts on what may vary between flights
+    mistakes: tuple[Mistake, ...] = ()  # of the logs' commands, corrected before the selection
+    # alternative sets of laws, best first
+    explanations: tuple[tuple[Law, ...], ...] = ()
+    held_out: HeldOut | None = None  # if any effect was selected
     work: Any = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Finding:
@@ -221,19 +210,19 @@ class Diagnosis:
 
     @property
     def named(self) -> tuple[str, ...]:
-        """Effects of ``theta``."""
+        """Return the names of the effects in ``theta``."""
         return tuple(self.theta)
 
     @property
     def expected(self) -> dict[str, float]:
-        """Return the sizes that another flight is expected to have: those named, and the means of
-        what varies.
+        """Return the sizes expected in another flight: those in ``theta``, and the means of effects
+        that vary.
         """
         means = {name: mean for s in self.scatter if s.found for name, mean in s.mean.items()}
         return means | dict(self.theta)
 
     def to_dict(self) -> dict[str, Any]:
-        """All but ``work``, for JSON."""
+        """Return all fields but ``work``, for JSON."""
         plain = asdict(replace(self, work=None))
         del plain["work"]
         return plain
