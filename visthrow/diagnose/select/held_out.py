@@ -1,10 +1,10 @@
-"""What held-out flights say of the names: they decide.
+"""Cross-validate the selected effects on held-out flights.
 
-Each flight is left out in turn, the search repeated on the others by their statistics, and its
-answer predicts the one left out, with gusts integrated out. A set of names is confirmed if the
-interval of what it brings there lies above 0. If the interval holds 0, all its names are
-candidates. So are names that the searches do not find again. Names that do harm are withdrawn.
-A law outside the catalogue is kept only where flights that had no say in its coefficient repeat it.
+Each flight is left out in turn. The search is repeated on the statistics of the others, and its
+result predicts the held-out flight, with gusts integrated out. The set is confirmed if the interval
+of its gain there lies above 0. If it holds 0, all its effects become candidates. So do effects that
+the repeated searches do not find again. Effects that increase the error are withdrawn. A law
+outside the catalogue is kept only if flights that were not used for its coefficient repeat it.
 """
 
 from collections import Counter
@@ -49,35 +49,33 @@ from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, Hel
 
 MOST_FOLDS = 12
 FIRM = 1.0 - 1.0 / FEWEST
-"""More of the folds than this share must name a cause, or one of its class: of the fewest that can
-disagree, all.
+"""An effect, or another of its class, must be selected in more than this share of the folds; with
+``FEWEST`` folds, in all of them.
 """
-MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
+MOSTLY = 0.6  # share of the residual above which it is attributed to one axis or one flight
 
 
 @dataclass(frozen=True)
 class Crossed:
-    """Searches that leave groups of windows (flights) out."""
+    """Repeated searches, each without some groups of windows (flights)."""
 
-    groups: list[int]  # of each window
+    groups: list[int]  # group of each window
     left_out: str  # what the groups are
     statistics: Statistics  # by group
     folds: list[ndarray]  # rows of the statistics that are left out together
-    trained: ndarray  # sizes in floors that the others gave, shape (F, K)
-    named: Mapping[str, float]  # effect -> share of the folds that named it
+    trained: ndarray  # sizes for each group from the searches without it, in floors, shape (F, K)
+    named: Mapping[str, float]  # effect -> share of the folds that selected it
 
 
 @dataclass(frozen=True)
 class Work:
-    """A diagnosis' problem, the model as it stands, and the model with what was selected: for gain,
-    report, plan and blind limits.
-    """
+    """Points before and after a selection, for gain, report, plan and blind limits."""
 
-    before: Point
-    after: Point
+    before: Point  # nothing selected
+    after: Point  # with the selected effects
     active: tuple[int, ...]
-    crossed: Crossed | None = None  # searches without some of the flights
-    candidates: tuple[int, ...] = ()  # that were free when the active effects were sized
+    crossed: Crossed | None = None  # the cross-validation, if done
+    candidates: tuple[int, ...] = ()  # effects that were free when the active ones were estimated
 
     @property
     def problem(self) -> Problem:
@@ -86,6 +84,9 @@ class Work:
 
 
 def groups_of(point: Point) -> tuple[list[int], str]:
+    """Return the group of each window for cross-validation, and what the groups are: flights, or
+    thirds of flights if there are few.
+    """
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= FEWEST or len(flights) < FEWEST:
         return flights, "flights"
@@ -97,9 +98,10 @@ def groups_of(point: Point) -> tuple[list[int], str]:
 
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
-    """Repeat a selection without each of the flights, by statistics, unless that was done; random
-    shares are integrated out. Candidates are sized as in the diagnosis, but predict nothing.
-    """
+    """Repeat a selection without each of the flights, by the statistics, unless that was done.
+
+    Random shares are integrated out. Candidates are free, as in the diagnosis, but their sizes are
+    not used for the prediction."""
     work = diagnosis.work
     if work.crossed is not None:
         return work.crossed
@@ -129,7 +131,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         window_sets = occam_window(linear, {NOTHING, selected}, selected, pairs=False)
         chosen = max(window_sets, key=window_sets.get)
         if window_sets[chosen] < linear.value(selected) + STRONG:
-            chosen = selected  # the training cannot tell it from others, and does not deny it
+            chosen = selected  # it is nearly as good as the best set of the training flights
         written = [j for j in columns_of(chosen) if j not in work.candidates]
         value = linear.value(chosen)
         behind = {s: value - v for s, v in window_sets.items()} | {chosen: 0.0}
@@ -144,10 +146,10 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
 
 
 def count_telling(promised: ndarray) -> ndarray:
-    """Return the number of flights that can tell: their promise is strong, or no less than the
-    mean flight's.
+    """Return the number of informative flights: those whose predicted gain is strong, or at least
+    as large as the mean flight's.
 
-    ``promised``: nats that a name promises on each flight, shape (F, ...); the result has shape
+    ``promised``: predicted gain of each flight [nats], shape (F, ...); the result has shape
     (...)."""
     return (promised >= np.minimum(STRONG, promised.mean(0))).sum(0)
 
@@ -155,25 +157,25 @@ def count_telling(promised: ndarray) -> ndarray:
 def borne_out(
     statistics: Statistics, trained: ndarray, theta: ndarray
 ) -> tuple[float, float, float]:
-    """Return the part of what names promise on held-out flights that they bring there, with a 95 %
-    interval.
+    """Return the ratio of actual to predicted gain on held-out flights, with a 95 % interval.
 
-    A right size promises theta' I theta / 2 nats. It brings more, and the part exceeds 1, where
-    unnamed effects below their floors push the same way.
+    The predicted gain is theta' I theta / 2 nats. The ratio exceeds 1 if effects below their floors
+    act in the same direction.
 
-    ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``: sizes that
-    all flights gave, shape (K,)."""
+    ``trained``: sizes from the other flights, in floors, shape (F, K); ``theta``: sizes from all
+    flights, shape (K,)."""
     promised = 0.5 * theta @ statistics.information @ theta
     brought = 0.5 * (statistics.absolute.square - statistics.about(trained).square)
     return share_of(promised, brought)
 
 
 def share_of(promised: ndarray, brought: ndarray) -> tuple[float, float, float]:
-    """Return the part of promised nats that flights bring, with a 95 % interval; shape (F,) both.
+    """Return the ratio of actual to predicted gain, with a 95 % interval.
 
-    A right size brings what it promises with a variance of twice that. The interval is that of the
-    flights' scatter about the part (Student, over those that can tell), or of this chance where it
-    is wider."""
+    For the true size, the actual gain has the predicted one as its mean and twice that as its
+    variance. The interval is Student's from the scatter of the informative flights, or that of this
+    variance if it is wider. ``promised``, ``brought``: predicted and actual gain of each flight
+    [nats], shape (F,)."""
     total = float(promised.sum())
     if total <= 0.0:
         return 0.0, np.nan, np.nan
@@ -191,10 +193,10 @@ def share_of(promised: ndarray, brought: ndarray) -> tuple[float, float, float]:
 def channel_gains(
     work: Work, groups: Sequence[int], trained: ndarray, box: ndarray | None = None
 ) -> tuple[ChannelGain, ...]:
-    """Prediction errors on held-out flights of every measured channel.
+    """Return the prediction errors of every measured channel on held-out flights.
 
-    ``groups``: what is left out together, of each window; ``trained``: sizes in floors that the
-    others gave, shape (F, K); ``box``: squared errors of a black box, shape (F, C, H)."""
+    ``groups``: held-out group of each window; ``trained``: sizes from the other groups, in floors,
+    shape (F, K); ``box``: squared errors of a black box, shape (F, C, H)."""
     before = work.before
     after = work.after
     names = work.problem.model.channels
@@ -209,7 +211,8 @@ def channel_gains(
     earlier = errors(before.windows, groups, after.noise, plain, len(names)).square
     if box is None:
         box = np.full_like(earlier, np.nan)
-    # before, after, of noise alone, of the black box, and of what the sizes change: (5, F, C, H)
+    # before, after, of noise alone, of the black box, and of the change by the effects: (5, F, C,
+    # H)
     squares = np.stack((earlier, left.square, left.floor, box, promised))
     gains = []
     for c, name in enumerate(names):
@@ -221,8 +224,8 @@ def channel_gains(
 
 def _channel(name: str, sigma: float, count: ndarray, squares: ndarray) -> ChannelGain:
     """Return the gain of a channel; ``count``: samples by flight and horizon, shape (F, H);
-    ``squares``: sums before, after, of noise alone, of the black box and of what the sizes change,
-    by flight and horizon, shape (5, F, H).
+    ``squares``: sums before, after, of noise alone, of the black box and of the change by the
+    effects, by flight and horizon, shape (5, F, H).
     """
     by_flight = squares.sum(2)
     samples = count.sum(0)
@@ -242,15 +245,15 @@ def gain_of(
 ) -> tuple[float, float, float]:
     """Return the gain 1 - sqrt(sum after / sum before) with a 95 % interval.
 
-    Flights excite a cause unequally, and errors of another origin are left in each. So a flight's
-    fall is compared with what the sizes promise there, and what is left with its number of samples.
-    The interval is that of the flights' scatter about both (Student, over those that can tell), or
-    of noise alone where it is wider.
+    Flights excite an effect unequally, and errors of other origin remain in each. So the decrease
+    in a flight is compared with the predicted one, and the remaining error with the number of
+    samples. The interval is Student's from the scatter of the informative flights about both, or
+    that of noise alone if it is wider.
 
     Args:
         before: sums of squares by flight, in sigmas, shape (F,).
-        after: those that held-out sizes leave, shape (F,).
-        promised: squares of what the sizes change, shape (F,).
+        after: the same after the effects were applied, shape (F,).
+        promised: sums of squares of the change by the effects, shape (F,).
         count: number of samples, shape (F,).
 
     Source: the delta method for log(after / before), van der Vaart 1998, ch. 3.
@@ -266,10 +269,10 @@ def gain_of(
     if n > 1 and total > 0.0:
         rest = after - left * count / count.sum()
         differing = fall - fall.sum() * promised / total
-        # of each flight on log(after / before)
+        # influence of each flight on log(after / before)
         influence = (fall.sum() / left * rest - differing) / old
         scatter = stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1.0) * (influence**2).sum())
-        # noise scatters a fall with 4 times its promise as variance
+        # by noise alone, a decrease has 4 times the predicted one as its variance
         chance = NORMAL_95 * np.sqrt(4.0 * total) / old
         reach = max(scatter, chance)
     value = np.log(left / old)
@@ -277,7 +280,7 @@ def gain_of(
 
 
 def measure(diagnosis: Diagnosis) -> HeldOut:
-    """Ask held-out flights about the names of a search."""
+    """Cross-validate the effects of a diagnosis."""
     work = diagnosis.work
     cross = crossed(diagnosis)
     floors = work.problem.priors.floor
@@ -289,16 +292,16 @@ def measure(diagnosis: Diagnosis) -> HeldOut:
 
 @dataclass(frozen=True)
 class Doubt:
-    """A reason against names."""
+    """A reason to change the verdict on some effects."""
 
     names: Sequence[str] = ()
-    verdict: str = result.CANDIDATE  # that their findings get instead
-    why: str = ""  # ends the sentence of each finding
-    reason: str = ""  # of the overall verdict, if no name stays
+    verdict: str = result.CANDIDATE  # new verdict
+    why: str = ""  # appended to the sentence of each finding
+    reason: str = ""  # of the overall verdict, if no effect remains
 
 
 def judged(diagnosis: Diagnosis) -> Diagnosis:
-    """A diagnosis as held-out flights leave it."""
+    """Return the diagnosis with the effects that held-out flights confirm."""
     if diagnosis.overall == result.NO_EFFECT:
         return _innovations(diagnosis)
     spanning = [n for n in diagnosis.theta if diagnosis[n].low <= 0.0 <= diagnosis[n].high]
@@ -321,8 +324,8 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
-    """Return which names held-out flights deny or do not confirm, or searches without some of them
-    do not find again.
+    """Return the effects that held-out flights contradict or do not confirm, or that the repeated
+    searches do not find again.
     """
     uncompared = not compares_phases(diagnosis.work.after)
     return (
@@ -333,9 +336,9 @@ def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
 
 
 def _harm(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | None:
-    """Return the doubt where held-out flights are explained worse with the names.
+    """Return a doubt if the effects increase the error of held-out flights.
 
-    ``uncompared``: whether no calm phase tells what gusts are."""
+    ``uncompared``: whether there is no calm phase to compare with."""
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
     if measured.share > 0.0 and not harmed:
         return None
@@ -348,7 +351,7 @@ def _harm(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | 
 
 
 def _no_confirmation(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | None:
-    """Return the doubt where held-out flights do not bear out the names, or no channel's error
+    """Return a doubt if held-out flights do not confirm the effects, or no channel's error
     falls.
     """
     falls = [c.low if uncompared else c.gain for c in measured.channels]
@@ -366,9 +369,9 @@ def _no_confirmation(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) 
 
 
 def _disagreement(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
-    """Return the doubt about names that searches without some flights do not find again."""
+    """Return the doubt about effects that searches without some flights do not find again."""
     unsure = []
-    for name in diagnosis.theta:  # what names one of a class names it
+    for name in diagnosis.theta:  # another of its class counts as well
         alike = (name, *diagnosis[name].partners)
         if sum(measured.named_in.get(member, 0.0) for member in alike) < FIRM + 1e-9:
             unsure.append(name)
@@ -378,7 +381,7 @@ def _disagreement(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
 
 
 def _explain(diagnosis: Diagnosis) -> Diagnosis:
-    """Return a diagnosis of confirmed names that says how much of the error is left."""
+    """Add the reasons of a confirmed diagnosis: how much of the error remains."""
     if diagnosis.overall == result.UNKNOWN:
         return diagnosis
     gains = diagnosis.held_out.channels
@@ -390,7 +393,7 @@ def _explain(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _describe_known(diagnosis: Diagnosis) -> str:
-    """Return how many causes are named, and what held-out flights show beyond the noise."""
+    """Describe how many effects were found, and the remaining error on held-out flights."""
     text = f"{len(diagnosis.theta)} named"
     unsure = [f for f in diagnosis.findings if f.verdict == result.CANDIDATE]
     candidates = {frozenset((f.name, *f.partners)) for f in unsure}
@@ -411,16 +414,14 @@ def _describe_known(diagnosis: Diagnosis) -> str:
 
 
 def _find_unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
-    """Return channels of which far more than noise is left."""
+    """Return the channels whose remaining error is far above the noise."""
     return [c for c in gains if c.after > UNKNOWN_RATIO * c.floor]
 
 
 def _innovations(diagnosis: Diagnosis) -> Diagnosis:
-    """A diagnosis without a name: what the model leaves ahead of a window's begin must be near the
-    noise.
+    """Check a diagnosis without selected effects: the prediction errors must be near the noise.
 
-    Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
-    """
+    With a calm phase to compare with, excessive latent forces were checked instead."""
     work = diagnosis.work
     point = work.after
     if compares_phases(point):
@@ -442,14 +443,14 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
-    """Return the diagnosis with another verdict on doubted names and the members of their classes.
+    """Change the verdict on doubted effects and the members of their classes.
 
-    Other names keep their sizes and deviations. A candidate becomes BOUNDED if it has no evidence
-    where the search ended: initial states and derivatives that were fitted since it was selected
-    may explain what it did.
+    Other effects keep their sizes and deviations. A candidate without evidence at the end of the
+    search becomes BOUNDED: initial states and derivatives that were fitted after its selection may
+    explain the same.
 
-    If no name stays, the overall verdict is UNKNOWN, in the block of the name with most evidence.
-    """
+    If no effect remains, the overall verdict is UNKNOWN, in the block of the effect with most
+    evidence."""
     if not doubt.names:
         return diagnosis
     work = diagnosis.work
@@ -481,8 +482,8 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
 
 
 def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tuple[Finding, ...]:
-    """Return the findings with another verdict on doubted names and the members of their classes;
-    ``remaining``: other names.
+    """Return the findings with the new verdict on doubted effects and the members of their classes;
+    ``remaining``: other effects.
     """
     partners = [diagnosis[name].partners for name in doubt.names]
     removed = set(doubt.names).union(*partners) - set(remaining)
@@ -498,7 +499,7 @@ def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tu
 
 
 def share_text(share: float, low: float, high: float) -> str:
-    """Return in words what :func:`borne_out` returns, as a clause on held-out flights."""
+    """Return the result of :func:`borne_out` as a clause about held-out flights."""
     if np.isnan(low):
         return "only one of them can tell"
     return (
@@ -507,19 +508,19 @@ def share_text(share: float, low: float, high: float) -> str:
 
 
 def _no_gain(measured: HeldOut) -> str:
-    """Return the gains of all channels, of which none is sure."""
+    """Return the gains of all channels as text, none of which is certain."""
     gains = (f"{c.channel} {100 * c.gain:.0f} % {c.interval}" for c in measured.channels)
     return f"no channel's error falls for sure: {', '.join(gains)}"
 
 
 def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
-    """Return which flight would settle it."""
+    """Return the flight to be flown next, as text."""
     manoeuvres = list(dict.fromkeys(m for name in names for m in diagnosis[name].manoeuvres))
     return f"fly once more{f', such as: {manoeuvres[0]}' if manoeuvres else ' like these'}"
 
 
 def _remaining(c: ChannelGain, work: Work) -> str:
-    """Return a sentence on what remains of a channel's error, and of which kind it is."""
+    """Return a sentence about a channel's remaining error and its kind."""
     factor, unit = readable(c.unit)
     text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
@@ -530,9 +531,7 @@ def _remaining(c: ChannelGain, work: Work) -> str:
 
 
 def _kind(work: Work, channel: int) -> str:
-    """Return where a channel's remaining error lies: in an axis, in a flight, or growing with the
-    time in the flight.
-    """
+    """Describe a channel's remaining error: mostly in one axis or flight, or growing with time."""
     point = work.after
     windows = [w for w in work.after.windows if np.any(w.channel == channel)]
     by_axis = np.zeros(3)
@@ -563,10 +562,10 @@ def _kind(work: Work, channel: int) -> str:
 
 
 def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, float]:
-    """Return the part of what laws promise that flights without a say in their coefficients bear
-    out beside the names as all flights size them, with its 95 % interval.
+    """Return the ratio of actual to predicted gain of laws on held-out flights, with its 95 %
+    interval; effects keep their sizes from all flights.
 
-    ``laws``: numbers of the laws' terms among the effects."""
+    ``laws``: indices of the laws' terms among the effects."""
     statistics = point.by_window.by(groups_of(point)[0])
     count = len(point.problem.model.effects)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)

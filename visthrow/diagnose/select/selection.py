@@ -1,10 +1,10 @@
-"""Selection of causes: Occam's window by the statistics, the simulation as judge among its best.
+"""Select the set of candidates that explains the flights best.
 
-One loop over sets of candidates of every kind: list the sets near the best by the linear statistics
-(:mod:`visthrow.diagnose.select.occam`), simulate the most promising until what one gains exceeds
-what the next promises, go over to the best, linearise there, and repeat until the best set stays.
-What was simulated is remembered: it tells how far short of its promise a move falls. Candidates
-that need the model's own latent forces, terms of laws, are offered once no other set is worth more.
+One loop treats candidates of every kind: list the sets near the best by the linear statistics
+(:mod:`visthrow.diagnose.select.occam`); simulate the most promising ones until the gain of one
+exceeds the predicted gain of the next; move to the best, linearise there, and repeat until the best
+set stays the same. The results of simulations are kept, as they show by how much a predicted gain
+is too high. Terms of laws are offered once no set of other candidates is better.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -48,23 +48,23 @@ from visthrow.diagnose.select.point import (
 )
 from visthrow.diagnose.select.result import SelectionStep
 
-SHORTLIST = 12  # sets that promise most, which are simulated where they are near the best
-FIRST = 4  # sets that are simulated although they promise less than the best, by up to WINDOW
-REPORTED_SETS = 10  # sets that a step keeps for the report
+SHORTLIST = 12  # most promising sets that may be simulated
+FIRST = 4  # sets that are simulated even if their prediction is up to WINDOW behind the best
+REPORTED_SETS = 10  # sets that a step records for the report
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A set of candidates where the simulation was run with it."""
+    """A set of candidates that was simulated."""
 
     chosen: Names
     point: Point
-    occam: float = 0.0  # nats by which random shares are worth more at their best than all sizes
-    lead: float = 0.0  # of the best set [nats]
+    occam: float = 0.0  # evidence at the best deviations of random shares over the integrated one
+    lead: float = 0.0  # value minus that of the best set [nats]
 
     @cached_property
     def columns(self) -> list[int]:
-        """Return the numbers of the effects that all flights share."""
+        """Return the indices of the effects that have one size in all flights."""
         return columns_of(self.chosen)
 
 
@@ -81,20 +81,20 @@ class Selector:
     def __post_init__(self) -> None:
         self.best = Trial(NOTHING, self.nominal)
         self.origin = self.nominal  # where the derivatives were taken
-        self.window: list[tuple[Trial, float]] = []  # sets that are possible, with nats behind
+        self.window: list[tuple[Trial, float]] = []  # possible sets, with nats behind the best
         self._linear: dict[Point, Linear] = {}
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
         self._visited = {NOTHING}
-        self._settled_sets = {NOTHING}  # at which derivatives were taken, or still held
-        self._simulated = {NOTHING: 0.0}  # nats of each set ahead of the best
+        self._settled_sets = {NOTHING}  # sets at which derivatives were taken or checked
+        self._simulated = {NOTHING: 0.0}  # lead of each simulated set over the best [nats]
         self._proposed: set[Names] = set()
         self._followed: set[Names] = set()
-        self._every = False  # whether any effect may differ among flights
+        self._every = False  # whether any effect may vary between flights
         self._offer()
 
     @property
     def problem(self) -> Problem:
-        """Return the problem, with the terms that were offered so far."""
+        """Return the problem, with the terms offered so far."""
         return self.nominal.problem
 
     def _offer(self) -> None:
@@ -106,15 +106,15 @@ class Selector:
 
     @cached_property
     def _acting(self) -> list[str]:
-        """Block that each effect of the model acts in."""
+        """Return the block on which each effect of the model acts."""
         return acts_on(self.nominal, range(len(self.problem.model.effects)))
 
     def penalty(self, chosen: Names) -> float:
         """Return the penalty of a set [nats].
 
-        That an effect differs among flights is a second claim beside its existence. What acts in
-        the block of a law may be a part of its form and must be worth more than elsewhere. Without
-        a calm phase to compare with, a law stands in place of all names."""
+        That an effect varies between flights is a second claim beside its existence. An effect in
+        the block of a law may be part of the law's form, so its penalty is higher. Without a calm
+        phase to compare with, a law excludes all other candidates."""
         total = sum(c.claims * self.threshold + c.penalty for c in without_means(chosen))
         forms = laws_of(chosen)
         if not forms:
@@ -127,7 +127,7 @@ class Selector:
         return total + len(charged) * terms.LAW
 
     def block_of(self, j: int) -> str:
-        """Return the block that an effect of the model acts in."""
+        """Return the block on which an effect of the model acts."""
         return self._acting[j]
 
     def linear(self, point: Point) -> Linear:
@@ -138,7 +138,7 @@ class Selector:
         return self._linear[point]
 
     def run(self, begin: Names = NOTHING) -> "Selector":
-        """Select, beginning with a set."""
+        """Run the selection, starting from a set."""
         for start in self._try(self.nominal, [begin] if begin else []):
             self._go(start)
         while self._moved() or self._relinearise() or self._propose() or self._widen():
@@ -146,10 +146,10 @@ class Selector:
         return self
 
     def _widen(self) -> bool:
-        """Let any effect differ among flights; False where that was done.
+        """Let any effect vary between flights; return False if that was done before.
 
-        Before the narrower forms were tried, the bend of an effect that all flights share looks
-        like a difference among them."""
+        It comes last, because the nonlinearity of an effect with one size looks like a variation
+        between flights."""
         if self._every:
             return False
         self._every = True
@@ -157,13 +157,13 @@ class Selector:
         return True
 
     def _moved(self) -> bool:
-        """Simulate the best sets, and go over to the one that is worth most; False where the
-        present set stays.
+        """Simulate the most promising sets and move to the best; return False if the present set
+        stays.
         """
         listed = self._list_sets()
         leads = {}
         least = -np.inf
-        near: list[Trial] = []  # a trial's matrices are large: others are forgotten
+        near: list[Trial] = []  # others are dropped, as a trial's matrices are large
         better: list[Trial] = []
         while chosen := self._choose_next(listed, leads, least):
             leads[chosen] = -np.inf
@@ -186,8 +186,8 @@ class Selector:
         return True
 
     def _keep(self, near: list[Trial]) -> None:
-        """Keep the sets that are possible beside the best: trials, and those that were the best
-        before, simulated again from where the best is.
+        """Store the possible sets: trials near the best, and sets that were the best before, which
+        are simulated again from the point of the best.
         """
         earlier = self._visited - {self.best.chosen}
         known = [s for s in earlier if self._simulated.get(s, -np.inf) > -self._limit(s)]
@@ -197,10 +197,10 @@ class Selector:
         self.window = [(self.best, 0.0), *((t, max(-t.lead, 0.0)) for t in near)]
 
     def _list_sets(self) -> dict[Names, float]:
-        """Return sets near the best, with the nats by which they are ahead of the present one by
-        the statistics: of where it is, of noise levels that leave every effect its size, and sets
-        of few causes by those of the model as it stands.
-        """
+        """List sets near the best, with their predicted lead over the present one [nats].
+
+        Leads are predicted from the statistics at the present point, from the same with the noise
+        levels for free effects, and, for small sets, from the statistics at the nominal point."""
         present = self.best.chosen
         ahead_of = {}
         free = self.best.point.with_all_effects_noise
@@ -219,17 +219,17 @@ class Selector:
     def _choose_next(
         self, listed: Mapping[Names, float], tried: Mapping[Names, float], minimum: float
     ) -> Names:
-        """Return the next set to be simulated, the best that promises more than ``minimum`` [nats]
-        and may be possible; NOTHING where there is none.
+        """Return the most promising set to simulate next, if its expected lead exceeds ``minimum``
+        [nats] and it may be possible; otherwise NOTHING.
 
-        A move is expected to fall short of what derivatives promise as its parts did."""
+        The prediction of a move is corrected by the largest shortfall of its parts."""
         done = set(tried) | self._visited
         present = self.best.chosen
         shortfalls: dict[Names, float] = {}
         for simulated, nats in self._simulated.items():
             if nats < -WINDOW:
                 done.add(simulated)
-            if simulated in listed and simulated:  # all causes together say nothing of others
+            if simulated in listed and simulated:  # removing all at once predicts nothing
                 shortfalls[simulated ^ present] = listed[simulated] - nats
         expected = {}
         for chosen, promised in listed.items():
@@ -247,9 +247,10 @@ class Selector:
         return NOTHING
 
     def _limit(self, chosen: Names) -> float:
-        """Return by how many nats a set may be behind the best and still be possible: strongly, or
-        by a part of what an effect is worth that it replaces by another of its group.
-        """
+        """Return by how many nats a set may be behind the best and still be possible.
+
+        It is ``STRONG``, and more where one effect is replaced by another of its group: then also a
+        part of that effect's evidence."""
         best = self.best
         replaced = best.chosen - chosen
         new = chosen - best.chosen
@@ -262,8 +263,8 @@ class Selector:
         return min(WINDOW, STRONG + INEXACT * nats)
 
     def _doubt(self, chosen: Names) -> float:
-        """Return by how many nats the linear value of a set may be wrong: strongly, and by a part
-        of what its sizes are worth that are elsewhere.
+        """Return by how many nats the predicted value of a set may be wrong: ``STRONG``, and a part
+        of the evidence for the change of its sizes.
         """
         point = self.best.point
         change = point.posterior.estimate(columns_of(chosen)) - point.theta
@@ -284,17 +285,18 @@ class Selector:
                 self.progress(f"{names_of(s)}: not simulated, {error}")
                 continue
             trial = replace(trial, lead=self._value(trial) - self.value)
-            # what may not be named gains nothing
+            # an inadmissible set gains nothing
             nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)
             self._simulated[s] = max(nats, self._simulated.get(s, -np.inf))
             trials.append(trial)
         return trials
 
     def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
-        """Return those members of sets that are ahead, but may not be named, that are surely there.
+        """Reduce inadmissible sets that are ahead to their surely present members.
 
-        Beside the true cause nothing is left of a name that stood in for it. What derivatives
-        promise without that name, from where it stood in, says little."""
+        If a set contains the true effect and one that stood in for it, nothing remains of the
+        latter. The derivatives taken with the substitute predict the reduced set badly, so it is
+        simulated."""
         reduced = []
         for trial in tried:
             if trial.lead > ENOUGH_NATS and not self.is_admissible(trial):
@@ -304,9 +306,7 @@ class Selector:
         return [s for s in reduced if s not in self._simulated]
 
     def _take_blocks(self, point: Point, active: list[int]) -> Point:
-        """Return the point, or one that was linearised with the kinds of blocks that a set asks
-        for; once for each place in a row.
-        """
+        """Return a point linearised with the kinds of blocks of a set; the last one is kept."""
         kinds = self.problem.switches
         chosen = np.isin(np.arange(len(kinds)), active)
         theta = np.where(chosen, point.theta, 0.0)
@@ -320,8 +320,8 @@ class Selector:
         return self._turned[theta.tobytes()]
 
     def _value(self, trial: Trial) -> float:
-        """Return what a set is worth where it was simulated [nats]: not what derivatives promise
-        beyond what the simulation gave.
+        """Return the value of a simulated set [nats], without the gain that derivatives predict
+        beyond the simulated sizes.
         """
         point = trial.point
         evidence = point.evidence(trial.columns)
@@ -329,8 +329,8 @@ class Selector:
         return evidence - promised - trial.occam - self.penalty(trial.chosen)
 
     def is_admissible(self, trial: Trial) -> bool:
-        """Tell whether every member of a set is surely there, whatever half a floor of it is, lies
-        within its bounds in each flight, and matters.
+        """Return whether every member of a set is surely not 0 and not negligible, lies within its
+        bounds in each flight and, if a term of a law, moves the landing.
         """
         point = trial.point
         columns = trial.columns
@@ -342,17 +342,17 @@ class Selector:
         sizes = point.theta + shares
         outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
         if np.any(outside & (sizes != 0.0)):
-            return False  # a share of a flight has the bounds of its effect, to a floor
+            return False  # random shares too have the effect's bounds, plus a floor
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         return all(terms.moves_landing(point, j) for j in laws)
 
     def _follow_up(self, listed: Mapping[Names, float]) -> list[Trial]:
-        """Return the set that promises most of those that kept far less, simulated from derivatives
-        and initial states of where it leads, if it is worth more than the present set simulated
-        from the same derivatives and states.
+        """Take the most promising of the sets whose simulation fell far short, linearise at its
+        predicted sizes, and simulate it again from there. Return it if it is then better than the
+        present set simulated from the same derivatives.
 
-        A rope that whips forgets its initial state within a window; what was fitted for another
-        rope explains nothing. New states alone are no gain."""
+        The initial states of a whipping rope fit only the rope for which they were fitted. Better
+        states for the present set alone are no gain."""
         kinds = self.problem.switches
         point = self.best.point
         promising = []
@@ -380,9 +380,8 @@ class Selector:
         return [replace(trials[chosen], lead=lead)]
 
     def _relinearise(self) -> bool:
-        """Take derivatives where the best set is, once no other is better by the last ones; False
-        where these still hold. Sets that were judged by derivatives from elsewhere may be tried
-        again.
+        """Linearise at the best set, once no other is better; return False if the derivatives still
+        hold. Sets that were judged by other derivatives may then be tried again.
         """
         origin = self.origin
         chosen = self.best.chosen
@@ -396,7 +395,7 @@ class Selector:
         return True
 
     def _go(self, trial: Trial, last: bool = False) -> None:
-        """Take a set as the best; ``last``: whether no other is better by the derivatives."""
+        """Make a set the best; ``last``: whether no other is better by the derivatives."""
         self._simulated = {s: nats - trial.lead for s, nats in self._simulated.items()}
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
@@ -411,8 +410,8 @@ class Selector:
         self._linear = {self.nominal: self.linear(self.nominal)}
 
     def _settled(self, point: Point, active: list[int], last: bool) -> Point:
-        """Linearise where a set is, unless the last derivatives still hold or may lead on to other
-        sets, and step on where that moved the optimum.
+        """Linearise at a set and fit its sizes again, unless the last derivatives still hold or the
+        search is going on.
         """
         kinds = self.problem.switches
         cheap = self.problem.model.cheap
@@ -442,7 +441,7 @@ class Selector:
     def _record(
         self, top: Trial, leads: Mapping[Names, float], listed: Mapping[Names, float]
     ) -> None:
-        """Say what was selected, and keep what was compared for the report."""
+        """Report the selected set, and record the sets compared with it."""
         nats = {names_of(s): lead for s, lead in leads.items() if np.isfinite(lead)}
         ranked = sorted(listed.items(), key=lambda item: -item[1])[:REPORTED_SETS]
         screened = {names_of(s): float(gain) for s, gain in ranked}
@@ -451,8 +450,8 @@ class Selector:
         self.steps.append(SelectionStep(name, top.lead, screened, nats))
 
     def _propose(self) -> bool:
-        """Offer the terms of laws that say most, beside the set and in place of its names; False
-        where none is new.
+        """Offer the most promising terms of laws, beside the set and in place of its effects;
+        return False if there is no new one.
         """
         strongest = terms.strongest_forces(self.nominal) if self.laws else {}
         present = self.best.chosen
@@ -478,15 +477,15 @@ class Selector:
 
     @property
     def value(self) -> float:
-        """Return what the best set is worth [nats]."""
+        """Return the value of the best set [nats]."""
         return self._value(self.best)
 
     @property
     def names(self) -> list[int]:
-        """Return the numbers of the model's effects in the best set."""
+        """Return the indices of the model's effects in the best set."""
         return columns_of(c for c in self.best.chosen if not c.law)
 
 
 def names_of(chosen: Names) -> str:
-    """Return the names of a set in words."""
+    """Return the names of a set, separated by commas."""
     return ", ".join(sorted(c.name for c in chosen)) or "nothing"

@@ -1,6 +1,4 @@
-"""From a selection to verdicts: exactly one for every effect, one overall, each with its reason in
-words.
-"""
+"""Turn a selection into verdicts: one for every effect and one overall, each with its reason."""
 
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
@@ -58,11 +56,11 @@ from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.selection import Selector
 
 Answer = tuple[str, str, list[str], set[int]]
-"""Overall verdict, block of an unknown effect, reasons, and names that are withdrawn for it."""
+"""Overall verdict, block of an unknown effect, reasons, and effects that are withdrawn."""
 
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
-    """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
+    """Turn a finished selection into verdicts; ``commands``: the verdict on lost commands."""
     model = selection.nominal.problem.model
     scatter, shares = random_shares_of(selection)
     varying = {j for c in shares if c.group != EVENT for j in c.columns}
@@ -121,7 +119,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
 
 
 def _vary(selection: Selector, shares: Shares) -> Point:
-    """Give the best point these random shares, and return it."""
+    """Set the random shares of the best point, and return it."""
     point = selection.best.point
     if shares or point.shares:
         point = with_noise_at(replace(point, shares=shares), point.theta)
@@ -130,7 +128,7 @@ def _vary(selection: Selector, shares: Shares) -> Point:
 
 
 def _add_means(scatter: Sequence[Scatter], means: Mapping[str, float]) -> tuple[Scatter, ...]:
-    """Return verdicts on what varies with the means of their effects in these flights."""
+    """Add the means of the varying effects in these flights to the verdicts on them."""
     verdicts = []
     for s in scatter:
         mean = {name: means[name] for name in s.of if name in means}
@@ -144,10 +142,10 @@ def _covariance(
     active: Sequence[int],
     mean_part: np.ndarray,
 ) -> tuple[tuple[float, ...], ...]:
-    """Return the joint covariance of the findings' sizes, with what the mean of these flights keeps
-    of the differences between flights.
+    """Return the joint covariance of the findings' sizes, including the variance that differences
+    between flights leave in the mean of these flights.
 
-    ``mean_part``: share of the variance between flights that the mean keeps, shape (K,)."""
+    ``mean_part``: share of the variance between flights that remains in the mean, shape (K,)."""
     columns = list(active)
     sigma = point.posterior.covariance(columns)
     spread = sigma[np.ix_(columns, columns)] + MODEL_ERROR_FLOOR**2 * np.eye(len(columns))
@@ -158,11 +156,11 @@ def _covariance(
 
 
 def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
-    """Return the verdicts on what differs among flights or days, of the catalogue and of what was
-    selected; and the shares that were selected.
+    """Return verdicts on the catalogue's random effects and on the selected ones, and the selected
+    random shares.
 
-    All flights may share any size of an effect that varies; flights far from the mean are simulated
-    again at their own size."""
+    Each verdict leaves the mean of the effect free. Flights far from the mean are simulated again
+    at their own size."""
     best = selection.best
     problem = selection.problem
     priors = selection.problem.priors
@@ -181,7 +179,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
         linear = Linear(statistics, priors, (), lambda _: 0.0)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
-        # single flights that were found to differ may leave nothing that varies among all
+        # shares of single flights may explain all of the variation
         found = not usual and verdict.size > verdict.floor
         verdicts.append(replace(verdict, found=found))
         if not usual:
@@ -190,7 +188,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
 
 
 def _list_asked(selection: Selector, usual: Set[str]) -> list[Candidate]:
-    """Return the random shares that were selected, and the usual ones, by name, that were not."""
+    """Return the selected random shares, and those of the usual random effects not selected."""
     varying = [c for c in selection.candidates if c.group in (FLIGHT, DAY)]
     selected = [c for c in varying if c in selection.best.chosen]
     others = usual - {c.name for c in selected}
@@ -198,7 +196,7 @@ def _list_asked(selection: Selector, usual: Set[str]) -> list[Candidate]:
 
 
 def _means_of(selection: Selector, random: Candidate) -> set[Candidate]:
-    """Return the candidates for the sizes that all flights share of what a random share changes."""
+    """Return the candidates for the means of the effects that have a random share."""
     shared_sizes = [c for c in selection.candidates if c.group == ALL]
     return {c for c in shared_sizes if {*c.columns} & {*random.columns}}
 
@@ -211,13 +209,13 @@ def share_verdict(
     effect: RandomEffect,
     threshold: float,
 ) -> Scatter:
-    """Return the verdict on a random share by the evidence of its deviations.
+    """Return the verdict on a random share, from the evidence of its deviations.
 
     Args:
-        chosen: the set that it is a part of, or is asked together with.
+        chosen: the set that contains it, or beside which it is judged.
         fixed_shares: other random shares, with their deviations.
-        effect: that it is a share of.
-        threshold: of evidence [nats].
+        effect: the random effect of which it is a share.
+        threshold: evidence that a finding needs [nats].
     """
     sizes, nats = linear.profile(chosen, fixed_shares, c)
     statistics = linear.statistics
@@ -241,7 +239,9 @@ def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
 
 
 def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) -> Point:
-    """Return the point of what flights share, about the means of named effects that vary."""
+    """Return the point with random shares integrated out, linearised at the means of the selected
+    effects that vary.
+    """
     statistics = point.plain
     for j in sorted(varying):
         statistics = _straight(replace(point, plain=statistics), active, j)
@@ -250,7 +250,7 @@ def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) ->
 
 
 def _list_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:
-    """Return the names of each possible set, and its nats behind."""
+    """Return the names of each possible set, and how many nats it is behind the best."""
     sets = []
     for trial, nats in selection.window:
         sets.append((tuple(sorted(c.name for c in trial.chosen)), nats))
@@ -258,7 +258,9 @@ def _list_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]
 
 
 def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
-    """Return the effects of each possible set with the same random shares, and its nats behind."""
+    """Return the effects of each possible set with the best set's random shares, and how many nats
+    it is behind.
+    """
     random = {c for c in selection.best.chosen if c.group != ALL}
     sets = []
     for trial, nats in selection.window:
@@ -269,8 +271,8 @@ def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
 
 
 def _all_sets(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
-    """Return the effects that each possible set holds, the same in all flights or varying among
-    them, and its nats behind.
+    """Return the effects of each possible set, including those that vary between flights, and how
+    many nats it is behind.
     """
     sets = []
     for trial, nats in selection.window:
@@ -280,8 +282,8 @@ def _all_sets(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
 
 
 def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
-    """Return the laws of the set, then others one by one in their place, best first, where flights
-    without a say in their coefficients repeat them; else none, and why.
+    """Return the selected laws, then alternatives to them, best first, as far as held-out flights
+    repeat them; if they do not repeat the selected ones, return none and the reason.
     """
     best = selection.best
     if not laws_of(best.chosen):
@@ -298,7 +300,7 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
         share, low, high = repeated_share(best.point, columns)
         if low > 0.0:
             repeated.append(terms.laws(best.point, columns_of(chosen), value[chosen]))
-        elif chosen == best.chosen:  # none in place of a better one
+        elif chosen == best.chosen:  # then alternatives are not reported either
             by_flight = best.point.plain.information[:, columns, columns].sum(axis=1)
             flight = best.point.plain.flights[np.argmax(by_flight)]
             return [], (
@@ -310,10 +312,11 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
 
 
 def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
-    """Return the names that may be a part of the form of something unknown in some blocks.
+    """Return the selected effects that may be part of an unknown law in some blocks.
 
-    A name acts in a block by its column or by what the other names cannot stand in for, as two
-    delays that differ by a force. What is not sure without those is such a part too."""
+    An effect acts on a block by its column, or by the part of its column that the other effects do
+    not explain, such as two delays that differ by a force. Effects that are not certain without
+    those are also part of it."""
     best = selection.best
     names = selection.names
     in_block = set()
@@ -327,7 +330,7 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
-    """Return laws, each formula once, with the coefficient of the best."""
+    """Return each law once, with the coefficient from the best explanation."""
     laws: dict[str, Law] = {}
     for together in explanations:
         for law in together:
@@ -336,7 +339,7 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 
 def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
-    """Return by how much each effect of one flight alone differs there from all flights' size."""
+    """Return the deviation of each effect that differs in a single flight, in its unit."""
     shares = estimate_shares(point.plain, point.theta, point.shares)
     shares *= point.problem.priors.floor
     row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
@@ -345,12 +348,12 @@ def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
 
 
 def _events(selection: Selector, point: Point) -> tuple[int, ...]:
-    """Return flights in which an effect has a size of its own, and flights with a window far
-    rougher than its phase that such a force would move.
+    """Return the flights in which an effect differs, and those with a window far rougher than its
+    phase, if the force is large enough to matter.
     """
     least = ALARM / point.noise.share.size
-    quantile = 2.0 * gammaincinv(0.5 * TAIL, least)  # of chi squared with so many degrees
-    roughest = np.sqrt(TAIL / quantile)  # share of the roughest, with Student's tails
+    quantile = 2.0 * gammaincinv(0.5 * TAIL, least)  # of chi squared with TAIL degrees of freedom
+    roughest = np.sqrt(TAIL / quantile)  # largest share expected by chance
     events = {c.flight for c in selection.best.chosen if c.group == EVENT}
     floors = floors_of(point)
     for window, share in zip(point.windows, point.noise.share):
@@ -362,7 +365,7 @@ def _events(selection: Selector, point: Point) -> tuple[int, ...]:
 
 
 def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
-    """The verdict where the simulation fails in most windows."""
+    """Return the diagnosis if the simulation fails in most windows."""
     reason = (
         f"the simulation stays finite in {usable} of {len(windows)} windows; check units, axes and"
         " the vehicle's configuration"
@@ -390,7 +393,7 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
 def _overall(
     selection: Selector, block_levels: Sequence[Level], scatter: Sequence[Scatter]
 ) -> Answer:
-    """Return the answer to all flights, by the first of these reasons that holds."""
+    """Return the overall verdict, by the first of these reasons that holds."""
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
     return (
@@ -406,9 +409,7 @@ def _overall(
 
 
 def _contradiction(selection: Selector) -> Answer | None:
-    """Return the answer where forces are missing that no cause explains: the channels do not belong
-    together.
-    """
+    """Return DATA INCONSISTENT if the unexplained forces are large compared with the thrust."""
     strong = too_strong(selection.best.point, INEXACT)
     if not strong:
         return None
@@ -421,7 +422,7 @@ def _contradiction(selection: Selector) -> Answer | None:
 
 
 def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
-    """Return the answer where laws were selected."""
+    """Return UNKNOWN if laws were selected."""
     best = selection.best
     forms = laws_of(best.chosen)
     if not forms:
@@ -437,7 +438,7 @@ def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
 
 
 def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | None:
-    """Return the answer where the flights push an estimate beyond its bound."""
+    """Return UNKNOWN if the flights push an estimate beyond its bound."""
     active = selection.best.columns
     stuck = [j for j in active if _is_on_bound(selection, j)]
     if not stuck:
@@ -453,8 +454,8 @@ def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | Non
 
 
 def _answer_crowded(selection: Selector, reasons: Sequence[str]) -> Answer | None:
-    """Return the answer where the names in a block cost more together than a law that nobody wrote
-    down, and the flights hardly tell some apart: parts of it are likelier.
+    """Return UNKNOWN if several effects act on one block, cost more together than an unknown law,
+    and are hardly distinguished by the flights.
     """
     law = selection.threshold + terms.LAW
     for block, members in _list_by_block(selection).items():
@@ -468,8 +469,8 @@ def _answer_crowded(selection: Selector, reasons: Sequence[str]) -> Answer | Non
 
 
 def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
-    """Return the answer where some function of one quantity explains what the names in a block
-    leave: the true cause has another equation. Of several blocks, it is the one with most evidence.
+    """Return UNKNOWN if a function of one quantity explains the residual of the selected effects in
+    a block; of several blocks, the one with most evidence is reported.
     """
     best = selection.best
     by_block = _list_by_block(selection)
@@ -491,8 +492,8 @@ def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
 def _answer_left_over(
     selection: Selector, excessive: Sequence[Level], reasons: list[str]
 ) -> Answer | None:
-    """Return the answer where latent forces are excessive; names that act in a block and leave it
-    as it was are withdrawn.
+    """Return UNKNOWN if latent forces are excessive, and withdraw effects on a block whose latent
+    forces they do not reduce.
     """
     if not excessive:
         return None
@@ -506,7 +507,7 @@ def _answer_left_over(
 
 
 def _unlike(scatter: Sequence[Scatter]) -> Answer | None:
-    """Return the answer where flights differ in several things that usually do not vary."""
+    """Return UNKNOWN if flights differ in several effects that usually do not vary."""
     catalogue = {v.name for v in random_effects()}
     forms = [s for s in scatter if s.found and s.name not in catalogue]
     if len(forms) < 2:
@@ -517,14 +518,14 @@ def _unlike(scatter: Sequence[Scatter]) -> Answer | None:
 
 
 def _answer_explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
-    """Return the answer where nothing is missing."""
+    """Return KNOWN or NO EFFECT, if nothing is missing."""
     if selection.best.columns:
-        return result.KNOWN, "", [], set()  # held-out flights give the reason
+        return result.KNOWN, "", [], set()  # the reason comes from held-out flights
     nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
     unlike = sorted(c.name for c in selection.best.chosen if c.group == EVENT)
-    if len(unlike) > 1:  # one flight that differs is an accident: the model explains the others
+    if len(unlike) > 1:  # a single flight that differs is regarded as an accident
         besides += unlike
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
@@ -532,8 +533,8 @@ def _answer_explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer
 
 
 def _list_by_block(selection: Selector) -> dict[str, list[int]]:
-    """Return the names that act in each block; none where no calm phase tells what gusts are, for
-    what is left over then speaks of a wrong form.
+    """Return the selected effects that act on each block; empty without a calm phase to compare
+    with, as the residuals then show a wrong form.
     """
     blocks: dict[str, list[int]] = {}
     for j in selection.names if compares_phases(selection.nominal) else ():
@@ -551,7 +552,7 @@ def _excess(level: Level) -> str:
 
 
 def _is_on_bound(selection: Selector, j: int) -> bool:
-    """Whether an estimate lies on its bound and the flights push it on by more than the
+    """Return whether an estimate lies on its bound and the evidence beyond it exceeds the
     threshold.
     """
     point = selection.best.point
