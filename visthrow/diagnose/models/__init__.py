@@ -1,3 +1,3 @@
-"""Small models beside the whole throw: a ball, a motor stand, a quadrotor alone, one with a
-payload; and the parts that a new model is made of.
+"""Models other than the whole throw: a ball, a motor on a stand, a quadrotor with or without a
+payload; and the base classes for new models.
 """

@@ -1,5 +1,5 @@
-"""Catalogues of models: the files of ``configs/model_effects``, and those of others, in the numbers
-that a model's parameters give.
+"""Catalogues of models: tables of effects from ``configs/model_effects`` or a user's file, scaled
+by a model's parameters.
 """
 
 import math
@@ -11,29 +11,28 @@ from typing import Any
 from sim.effects.effect import Effect
 from visthrow import config
 
-# of a prior deviation, by which a size at its bound may lie outside once it was written down
+# share of a prior deviation by which a size on its bound may exceed it after rounding
 ROUNDED = 1e-6
 
 
 @dataclass(frozen=True)
 class ModelEffect(Effect):
-    """An effect of a setup's model; a channel in braces is that which a parameter of this name
-    names, as ``{position}``.
+    """An effect of a model. A channel in braces stands for the value of that parameter, such as
+    ``{position}``.
     """
 
-    # bounds, prior_sd, floor -> parameters that they are multiples of, as "mass * arm"
+    # "bounds", "prior_sd" or "floor" -> parameters by which it is multiplied, such as "mass * arm"
     times: dict[str, str] = field(default_factory=dict)
-    # parameter of which theta takes no more than there is, in place of the lower bound
-    lowest: str = ""
-    needs: str = ""  # parameter that a setup may lack, and the effect with it
-    # numbers of the simulator that theta is added to, as "airs.wind_w.0", or with "-" taken from
+    lowest: str = ""  # parameter whose negative is the lower bound
+    needs: str = ""  # parameter without which the effect does not exist
+    # parameters of the simulator to which theta is added, such as "airs.wind_w.0"; "-" subtracts
     changes: tuple[str, ...] = ()
 
     def for_params(self, params: Any) -> "ModelEffect":
-        """Return the effect in the parameters' numbers."""
+        """Return the effect scaled by a model's parameters."""
 
         def scale(field_name: str) -> float:
-            """Return what a field is a multiple of."""
+            """Return the factor of a field."""
             factors = filter(None, self.times.get(field_name, "").split(" * "))
             product: float = math.prod(attrgetter(factor)(params) for factor in factors)
             return product
@@ -52,7 +51,7 @@ class ModelEffect(Effect):
 
 @dataclass(frozen=True)
 class ModelEffects:
-    """A file of ``configs/model_effects``."""
+    """The content of a file of ``configs/model_effects``."""
 
     effects: dict[str, ModelEffect]
 
@@ -63,7 +62,7 @@ def _tables(model: str) -> ModelEffects:
 
 
 def effects_of(model: str, params: Any) -> list[ModelEffect]:
-    """Return the effects of a setup's model in the order of its file."""
+    """Return the effects of a model in the order of its file."""
     return [
         e.for_params(params)
         for e in _tables(model).effects.values()
@@ -72,7 +71,7 @@ def effects_of(model: str, params: Any) -> list[ModelEffect]:
 
 
 def beyond_bounds(effect: Effect, size: float) -> str:
-    """Return in words that a size lies outside an effect's bounds; empty where it does not."""
+    """Return a message if a size lies outside an effect's bounds, else an empty text."""
     low, high = effect.bounds
     rounded = ROUNDED * effect.prior_sd
     if low - rounded <= size <= high + rounded:

@@ -1,17 +1,17 @@
-"""Laws outside the catalogue: a force or torque as coefficient times up to two scalars times one
-vector.
+"""Terms of laws outside the catalogue: a force or torque that is a coefficient times up to two
+scalars times a vector.
 
-Every factor has a unit, so the coefficient's unit follows; vectors are made of body axes, world
-vertical, rope and velocities, so that a law means the same after the world is turned about the
-vertical. A term is plain data (:class:`Term`), from which the simulator can build a block.
+Every factor has a unit, from which the coefficient's unit follows. Vectors are made of body axes,
+the world's vertical, the rope and velocities, so a law does not depend on the heading of the world
+frame. A term is plain data (:class:`Term`), from which the simulator can build a block.
 
-A torque in the rope's joint acts on both sides: M on the vehicle, -M on the rope. With n the rope's
-direction and l its length to the payload's centre, the couple -M on a rope that is straight does
-what a pair of forces does,
+A torque in the rope's joint acts on both sides: M on the vehicle, -M on the rope. With the rope's
+direction n and its length l to the payload's centre, the couple -M on a straight rope is equivalent
+to a pair of forces,
 
     F_p = (-M x n) / l on the payload,   -F_p at the mount,
 
-so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is
+so it is a combination of the latent forces of three blocks (:func:`loads`), and momentum is
 conserved."""
 
 import math
@@ -30,17 +30,15 @@ from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 Knots = Mapping[str, ndarray]
 
-JOINT = (  # block of the torque between vehicle and rope, which acts in all latent blocks at once
-    "rope joint"
-)
-BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
+JOINT = "rope joint"  # block of the torque between vehicle and rope; it acts on all latent blocks
+BLOCKS = (*LATENT_BLOCKS, JOINT)  # blocks on which a term can act
 SYMBOLS = dict(zip(BLOCKS, ("F", "M", "F_p", "M_j")))
 BASE_UNITS = ("kg", "m", "s")
 OF_PAYLOAD = ("payload_pos_w", "payload_vel_w", "tension")  # quantities at the knots of a replay
 
 
 class KnotValues(dict):
-    """Quantities at the knots, and what follows from them, computed when it is first asked for."""
+    """Quantities at the knots, and derived quantities, which are computed at their first use."""
 
     def __missing__(self, name: str) -> ndarray:
         """Compute a quantity by its definition."""
@@ -60,12 +58,12 @@ class Factor:
     """A scalar or a vector of the state."""
 
     symbol: str
-    unit: str  # of BASE_UNITS with their exponents
+    unit: str  # product of BASE_UNITS with exponents
     quantity: str  # at the knots, (k,) for a scalar, (k, 3) for a vector, in the block's frame
     needs: frozenset[str]  # keys of Window.knots
 
     def read(self, values: KnotValues) -> ndarray:
-        """Return its values at the knots."""
+        """Return the factor's values at the knots."""
         return values[self.quantity]
 
     @property
@@ -85,26 +83,26 @@ class Term:
 
     @property
     def depth(self) -> int:
-        """Number of factors."""
+        """Return the number of factors, including the vector."""
         return len(self.parts)
 
     @property
     def parts(self) -> list[Factor]:
-        """Scalars, then the vector."""
+        """Return the scalars, then the vector."""
         return [*(SCALARS[name] for name in self.factors), VECTORS[self.block][self.vector]]
 
     def read(self, values: KnotValues) -> ndarray:
-        """Return what it exerts at the knots with a coefficient of 1, shape (k, 3)."""
+        """Return the force or torque at the knots with a coefficient of 1, shape (k, 3)."""
         vector = VECTORS[self.block][self.vector].read(values)
         return _product(self.factors, values)[:, None] * vector
 
     def law(self, coefficient: float) -> LawParams:
-        """The law that it is with a coefficient."""
+        """Return the law with a coefficient."""
         return LawParams(self.block, self.factors, self.vector, coefficient)
 
     @property
     def needs(self) -> set[str]:
-        """Keys of Window.knots that its factors are made of."""
+        """Return the keys of Window.knots on which the factors depend."""
         return set().union(*(factor.needs for factor in self.parts))
 
     @property
@@ -119,17 +117,17 @@ class Term:
 
     @property
     def formula(self) -> str:
-        """The right-hand side with coefficient c."""
+        """Return the law's formula with coefficient c."""
         return f"{SYMBOLS[self.block]} = c {' '.join(factor.symbol for factor in self.parts)}"
 
 
 def describe_knots(
     flown: Knots, time: ndarray, mount: Sequence[float] | None
 ) -> dict[str, ndarray]:
-    """Return quantities at knots that a replay flew, with their times [s] and where a cable leads.
+    """Add times [s], mount and cable direction to the quantities that a replay returned at knots.
 
-    ``mount``: where the cable is attached [m, body frame, from the centre of mass]; None without a
-    payload, whose quantities are then left out."""
+    ``mount``: attachment of the cable [m, body frame, from the centre of mass]; None without a
+    payload, whose quantities are then dropped."""
     values = {**flown, "time": time}
     if mount is None:
         return {name: value for name, value in values.items() if name not in OF_PAYLOAD}
@@ -140,7 +138,7 @@ def describe_knots(
 
 
 def term_of(law: LawParams) -> Term:
-    """The term of a law that a file holds."""
+    """Return the term of a law."""
     return Term(law.block, law.factors, law.vector)
 
 
@@ -158,7 +156,7 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, ndarray]:
 
 
 def carries(latent_block: ndarray, block: str) -> bool:
-    """Whether a window has all latents that terms of a block act through."""
+    """Return whether a window has all latents on which terms of a block act."""
     latent_blocks = LATENT_BLOCKS if block == JOINT else (block,)
     return all(LATENT_BLOCKS.index(name) in latent_block for name in latent_blocks)
 
@@ -186,17 +184,17 @@ def _scale(factor: ndarray, vector: ndarray) -> ndarray:
 
 
 def _inverse(value: ndarray) -> ndarray:
-    """Return 1 over values, of which smaller ones count as :data:`sim.params.LOWEST`."""
+    """Return 1 over values, which are limited to at least :data:`sim.params.LOWEST`."""
     return 1.0 / np.maximum(value, LOWEST)
 
 
 def _saturate(vector: ndarray) -> ndarray:
-    """Direction of a vector, and less than a unit vector where it is slow."""
+    """Return the direction of a velocity; shorter than a unit vector at low speed."""
     return vector / np.hypot(_size(vector), SLOWEST)[:, None]
 
 
 def _turn_rate(arm: ndarray, arm_vel: ndarray) -> ndarray:
-    """Rate at which an arm turns whose end moves against its root [1/s]."""
+    """Return the angular rate of an arm whose end moves relative to its root [1/s]."""
     return cross(arm, arm_vel) / _dot(arm, arm)[:, None]
 
 
@@ -219,7 +217,7 @@ OPERATIONS: dict[str, Callable[..., ndarray]] = {
 
 
 def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
-    """Return the factors of a table of the file."""
+    """Make the factors of a table of ``sim/law_factors.toml``."""
     factors = {}
     for name, (symbol, unit, quantity, words) in rows.items():
         groups = [LAW_FACTORS["groups"].get(word, [word]) for word in words.split()]
@@ -227,23 +225,23 @@ def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
     return factors
 
 
-MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds
+MEASURED = LAW_FACTORS["measured"]  # factors that are not simulated, only logged
 
 SCALARS = _factors(LAW_FACTORS["scalars"] | MEASURED["scalars"])
-"""Scalars of a term."""
+"""Scalars by name."""
 
-ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
+ONLY_JOINT = ("joint_rate",)  # scalars that only terms in the rope's joint may have
 
 VECTORS = {
     block: _factors(rows | MEASURED["vectors"].get(block, {}))
     for block, rows in LAW_FACTORS["vectors"].items()
 }
-"""Vectors of a term by block, in that block's frame: world for forces, body for torques."""
+"""Vectors by block and name, in that block's frame: world for forces, body for torques."""
 
 
 @lru_cache(maxsize=32)
 def terms_of(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
-    """All terms of a block whose factors can be made of these knots, simplest first."""
+    """Return all terms of a block that these quantities allow, simplest first."""
     have = set(quantities)
     scalars = [name for name, factor in SCALARS.items() if factor.needs <= have]
     vectors = [name for name, factor in VECTORS[block].items() if factor.needs <= have]
@@ -257,8 +255,8 @@ def terms_of(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
 
 
 def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
-    """Return what all terms of :func:`terms_of` exert at the knots with a coefficient of 1, shape
-    (k, 3, T). Each product of scalars, and each vector, is computed once.
+    """Return the forces or torques of all terms of :func:`terms_of` at the knots with a coefficient
+    of 1, shape (k, 3, T). Each product of scalars, and each vector, is computed once.
     """
     vectors = VECTORS[terms[0].block]
     names = dict.fromkeys(term.vector for term in terms)
@@ -270,15 +268,15 @@ def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
 
 
 def loads(block: str, knots: KnotValues, values: ndarray) -> dict[str, ndarray]:
-    """Return the loads of terms in each latent block: a torque in the joint acts on the vehicle, on
-    the rope and, by it, on the payload.
+    """Return the loads of terms on each latent block; a torque in the joint acts on vehicle and
+    payload.
 
     ``values``: of the terms, shape (k, 3, T), in the block's frame.
     Returns the latent block's forces [N, world] or torques [N m, body], shape (k, 3, T).
     """
     if block != JOINT:
         return {block: values}
-    hangs = knots["tension"] > 0.0  # without a load the rope carries no torque
+    hangs = knots["tension"] > 0.0  # a slack rope carries no torque
     torque_b = np.swapaxes(values, 1, 2) * hangs[:, None, None]
     reach = knots["reach_w"][:, None, :]
     turn = np.stack([knots[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world

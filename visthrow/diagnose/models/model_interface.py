@@ -1,14 +1,13 @@
-"""What a model must give to be diagnosed: effects that could be missing from it, and its residuals
-linearised in them.
+"""The interface between models and the selection of effects.
 
-The selection of causes (:mod:`visthrow.diagnose.select`) knows nothing of vehicles or ropes.
-It sees windows of residuals
+The selection (:mod:`visthrow.diagnose.select`) does not depend on vehicles or ropes. It works on
+windows of residuals
 
     r = S theta + X b + G a + e
 
-with theta the sizes of the effects, b what is not known at the start of the window, a the latent
-forces, e sensor noise. The whole throw, a vehicle without payload, a ball in flight, a pendulum, a
-motor on a stand and a camera against motion capture are models of this one kind."""
+with the sizes theta of the effects, the unknown initial state b of the window, latent forces a and
+sensor noise e. The whole throw, a vehicle without payload, a ball in flight, a pendulum, a motor on
+a stand and a camera compared with motion capture are such models."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,26 +26,26 @@ def _no_indices() -> ndarray:
 
 @dataclass(frozen=True)
 class Window:
-    """Residuals of one stretch of a flight, about a linearisation point theta.
+    """Residuals and derivatives of a part of a flight at a linearisation point theta.
 
-    N samples (every component of every channel is a sample of its own), K effects in the model's
-    order, D nuisances, G latent-force coefficients."""
+    N samples (every component of a channel is a separate sample), K effects in the model's order,
+    D nuisances, G latent-force coefficients."""
 
-    flight: int  # number of the flight it was cut from
+    flight: int  # index of the flight
     phase: str  # hover, flight, throw or ballistic; free text for other models
     time: ndarray  # of the samples, in the flight's clock [s], shape (N,)
     channel: ndarray  # index into Model.channels, shape (N,)
-    # measured minus simulated, from b = 0 along the derivatives, in the channel's unit, shape (N,)
+    # measured minus simulated, extrapolated to b = 0, in the channel's unit, shape (N,)
     residual: ndarray
     sigma: ndarray  # standard deviation of the sensor noise, same unit, shape (N,)
-    effects: ndarray  # S: derivative of the simulated sample by theta, shape (N, K)
+    effects: ndarray  # S: derivatives of the simulated samples by theta, shape (N, K)
     nuisance: ndarray  # X, shape (N, D)
-    nuisance_sd: ndarray  # vague prior of b, about 0, shape (D,)
+    nuisance_sd: ndarray  # standard deviation of the vague prior of b, shape (D,)
     latent: ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
     # index into LATENT_BLOCKS, shape (G,)
     latent_block: ndarray = field(default_factory=_no_indices)
     latent_axis: ndarray = field(default_factory=_no_indices)  # 0, 1, 2 for x, y, z, shape (G,)
-    # of the knot [s], shape (G,): each block and axis has the same ones, in order
+    # time of the knot [s], shape (G,); each block and axis has the same knots, in order
     latent_time: ndarray = field(default_factory=lambda: np.zeros(0))
     knots: Mapping[str, ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
@@ -54,24 +53,24 @@ class Window:
     ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``, ``tension`` [N], ``mount_b`` (of the
     rope, from the centre of mass) [m, body frame].
     """
-    # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
+    # whether its initial motion is unknowable, such as that of a rope that has just become taut
     shaken: bool = False
     correlated: tuple[tuple[ndarray, ndarray], ...] = ()
-    """Of channels whose noise is not white: rows of their samples, shape (stamps, components), and
+    """For each channel with correlated noise: rows of its samples, shape (stamps, components), and
     the lower Cholesky factor of the correlation of a component's noise, shape (stamps, stamps).
     """
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """The point at which derivatives were taken, with the derivatives, so that initial states can
-    follow the effects from there.
+    """The point at which derivatives were taken, with the derivatives, from which initial states
+    are adjusted to other sizes of the effects.
 
-    A window whose state stays behind begins with a transient that no derivative tells of, such as
-    rotors out of balance."""
+    Without the adjustment, a window would begin with a transient that the derivatives do not
+    contain, such as unbalanced rotors."""
 
-    theta: Mapping[str, float]  # given to :meth:`Model.windows`
-    windows: Mapping[int, Window]  # what came, by number
+    theta: Mapping[str, float]  # argument of :meth:`Model.windows`
+    windows: Mapping[int, Window]  # returned windows, by index
 
 
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")
@@ -81,46 +80,44 @@ frame].
 
 
 class Model(Protocol):
-    """A simulation of measured flights that can be linearised about any sizes of its effects.
+    """A simulation of measured flights that can be linearised at any sizes of its effects.
 
-    A model is a subclass that gives effects, channels, windows and residuals. What else some models
-    can do has a default here that says that this one cannot."""
+    A model is a subclass with effects, channels, windows and residuals. The defaults of all other
+    methods mean that the model lacks that capability."""
 
     effects: Sequence[Effect]
     # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
     channels: Sequence[str]
-    device: str = "cpu"  # where it simulates, and the algebra of its windows with it
-    days: Sequence[int] = ()  # of each flight, by its number; none where the logs do not say
-    mistakes: Sequence[Any] = ()  # of the interface, which were corrected in its logs
-    cheap: bool = False  # derivatives are taken anew wherever the search goes
-    # whether what a law does to a window is far from its share at the knots, so that the search
-    # must simulate it
-    bends: bool = False
-    middle_speed: float = 0.0  # median speed of the rotors [rad/s]; 0 where none is measured
-    lawless: str = ""  # why no law outside the catalogue can act in it
-    notes: Sequence[str] = ()  # what it does not take of the flights, and why, in sentences
-    not_offered: int = 0  # effects that concern the flights, but were not chosen
+    device: str = "cpu"  # of the simulation
+    days: Sequence[int] = ()  # day of each flight, by index; empty if the logs do not state it
+    mistakes: Sequence[Any] = ()  # mistakes of the logs that were corrected
+    cheap: bool = False  # whether derivatives are taken again at each step of the search
+    bends: bool = False  # whether laws are so nonlinear that the search must simulate them
+    middle_speed: float = 0.0  # median speed of the rotors [rad/s]; 0 if not measured
+    lawless: str = ""  # why no law outside the catalogue can act in the model
+    notes: Sequence[str] = ()  # sentences about parts of the flights that are not used
+    not_offered: int = 0  # number of applicable effects that the user excluded
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise
+        """Simulate all windows with the effects at ``theta`` (0 by default), and linearise
         there.
         """
         ...
 
     def residuals(self, theta: Mapping[str, float], linearised: Linearised) -> list[ndarray]:
-        """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
+        """Return the residuals of :meth:`windows` alone, one array of shape (N,) for each window.
 
         Args:
             theta: sizes of the effects.
             linearised: where the caller's derivatives were taken, with the same kinds of blocks.
-                Initial states begin with those of that place and follow the effects; what that does
-                by the derivatives is added to the residuals again, which so are those of b = 0. A
-                model that fits initial states in every simulation has no need of it.
+                Initial states start from those at that point and are adjusted to the effects. The
+                linear effect of the adjustment is added to the residuals, which then belong to
+                b = 0. A model that fits initial states in every simulation ignores it.
         """
         ...
 
     def possible(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return the sizes, each within its bounds, cut to what the effects can have together."""
+        """Limit sizes, each within its bounds, to what is possible together."""
         return theta
 
     def plain(self) -> "Model":
@@ -128,29 +125,29 @@ class Model(Protocol):
         return self
 
     def with_laws(self, laws: Sequence[LawParams]) -> "Model":
-        """Return the model with further laws; itself where none can act in it."""
+        """Return the model with further laws; itself if none can act in it."""
         return self
 
     def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
-        """Return the change of some windows' samples by each command that does not come, shape
-        (N, T) each; none where the model has no commands.
+        """Return the change of some windows' samples if a command is lost, for each command, shape
+        (N, T) each; empty if the model has no commands.
 
         Args:
-            theta: sizes of the effects, at which :meth:`windows` was called before.
-            windows: numbers among those that it returned.
+            theta: sizes of the effects, with which :meth:`windows` was called before.
+            windows: indices of the windows that it returned.
         """
         return []
 
     def step_error(self) -> dict[str, float] | None:
-        """Return the largest change of any sample of each channel by a finer step, in its noise;
-        None where the step is no approximation.
+        """Return the largest change of any sample of each channel by a finer integration step,
+        relative to its noise; None if the model has no step.
         """
         return None
 
     def landings(
         self, theta: Mapping[str, float], flights: Sequence[int] | None = None
     ) -> Any | None:
-        """Return predicted and measured landings (``PredictedLandings``); None where no throw's
-        landing was measured.
+        """Return predicted and measured landings (``PredictedLandings``); None if no landing was
+        measured.
         """
         return None

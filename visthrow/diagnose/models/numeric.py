@@ -1,9 +1,8 @@
-"""A model that is simulated in NumPy and linearised by central differences, all windows and all
-lanes at once.
+"""Base class of models that are simulated in NumPy and linearised by central differences, all
+windows and all lanes at once.
 
-A lane is one simulation of one window with sizes of effects, unknowns at its start and latent
-forces of its own. What is not known at the start is fitted before the linearisation, so that the
-linearisation is about a path near the measured one."""
+A lane is one simulation of one window with given effects, initial state and latent forces. Initial
+states are fitted first, so that the linearisation is at a path near the measured one."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -25,62 +24,61 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import on_grid as on_grid
 
 EFFECT_STEP = 0.05
-"""Step of the differences by effects, in their prior deviations: errors of curvature cancel, those
-of rounding do not matter.
+"""Step of the central differences by effects, in prior deviations. Second-order errors cancel, and
+rounding does not matter.
 """
-NUISANCE_STEP = 1e-3  # step of the differences by unknowns at the start, in their prior deviations
-SETTLE_STEPS = 5
-# a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
-SETTLED = 1e-3
+NUISANCE_STEP = 1e-3  # step of the differences by initial states, in prior deviations
+SETTLE_STEPS = 5  # Gauss-Newton steps of the initial states
+SETTLED = 1e-3  # smallest predicted gain of such a step [nats]
 MOST_LANES = 6000  # simulated in one batch
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch(Window):
-    """A window before any simulation: its residual is what was measured, and it has no derivatives.
+    """A window before any simulation: its residual holds the measurements, without derivatives.
 
     All stretches of a model have the same D and G.
     """
 
     start: ndarray
-    """First guess of what is not known at the start, shape (D,)."""
+    """First guess of the initial state, shape (D,)."""
     data: Mapping[str, Any]
-    """What simulation and sensors read: inputs, stamps."""
+    """Inputs of simulation and sensors, such as stamps and commands."""
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """Simulations of one batch."""
+    """A batch of simulations."""
 
     owner: ndarray  # index of the stretch, shape (B,)
     theta: ndarray  # sizes of the effects, shape (B, K)
-    nuisance: ndarray  # unknowns at the start, shape (B, D)
+    nuisance: ndarray  # initial states, shape (B, D)
     latent: ndarray  # coefficients of the latent forces, shape (B, G)
 
     def part(self, rows: Any) -> "Lanes":
-        """Some of them."""
+        """Return some of the lanes."""
         return Lanes(self.owner[rows], self.theta[rows], self.nuisance[rows], self.latent[rows])
 
 
 class NumericModel(Model, ABC):
-    """A model whose subclasses give :meth:`windows_of`, :meth:`simulate` and :meth:`measure`."""
+    """A model whose subclasses implement :meth:`windows_of`, :meth:`simulate` and
+    :meth:`measure`.
+    """
 
     cheap = True
-    # whether the prior of the unknowns at the start says something: else it is about their fit
-    anchored = False
-    latent_step = 1.0  # of the differences by latent forces [N or N m]
-    # latent block and axis of each latent force, and the number of its knots over a window
-    pushes: Sequence[tuple[int, int]]
-    knot_count: int
-    table: str  # effects: a file of configs/model_effects by its name, or another by its path
-    needed: Sequence[str] = ()  # channels without which a log holds no window
-    inputs: Sequence[str] = ()  # channels that are there and drive the simulation
+    anchored = False  # whether the mean of the initial states' prior counts, rather than their fit
+    latent_step = 1.0  # finite difference of latent forces [N or N m]
+    pushes: Sequence[tuple[int, int]]  # latent block and axis of each latent force
+    knot_count: int  # knots of a latent force in a window
+    table: str  # catalogue: name of a file in configs/model_effects, or a path
+    needed: Sequence[str] = ()  # channels that a log must have
+    inputs: Sequence[str] = ()  # channels that drive the simulation
 
     def __init__(self, logs: Sequence[FlightLog], params: Any):
         """Cut the logs into windows; ``params``: of the subclass.
 
-        An effect that needs any other channel than those that residuals are taken of, or that drive
-        the simulation, cannot be seen. Raises LogError where there is no window."""
+        An effect is observable if its channels are among the residuals or the inputs. Raises
+        LogError if there is no window."""
         self.params = params
         self.stretches = self.cut(logs)
         if not self.stretches:
@@ -96,21 +94,19 @@ class NumericModel(Model, ABC):
         )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
-        self._slopes: list[ndarray] = []  # by the unknowns at the start
-        self._base = np.zeros(
-            len(self.effects)
-        )  # sizes that the model has before anything is found
-        self.laws: tuple[LawParams, ...] = ()  # that act in it besides
-        self._flown: NumericModel | None = None  # the same with more laws
+        self._slopes: list[ndarray] = []  # derivatives by the initial states
+        self._base = np.zeros(len(self.effects))  # sizes that correspond to theta = 0
+        self.laws: tuple[LawParams, ...] = ()  # laws outside the catalogue
+        self._flown: NumericModel | None = None  # a copy with further laws
 
     def catalogue(self) -> list[ModelEffect]:
-        """Return the effects of the model in the numbers of its parameters."""
+        """Return the effects of the model, scaled by its parameters."""
         return effects_of(self.table, self.params)
 
     def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
-        """Cut logs into windows; those that lack a channel hold none.
+        """Cut logs into windows, except those that lack a channel.
 
-        Raises LogError: all lack one.
+        Raises LogError: all logs lack one.
         """
         lacking = [[name for name in self.needed if not log.samples(name, 1)] for log in logs]
         usable = [i for i, names in enumerate(lacking) if not names]
@@ -123,11 +119,11 @@ class NumericModel(Model, ABC):
         return [stretch for i in usable for stretch in self.windows_of(logs[i], i)]
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
-        """Cut one log, the flight of a number, into windows."""
+        """Cut one log, with the index ``number``, into windows."""
         raise NotImplementedError
 
     def without_windows(self, logs: Sequence[FlightLog]) -> str:
-        """Say what of logs that hold no window is unlike a flight."""
+        """Return why these logs hold no window, as the end of an error message."""
         return ""
 
     def lay_out(
@@ -140,11 +136,11 @@ class NumericModel(Model, ABC):
         start: Sequence[float] = (),
         start_sd: Sequence[float] = (),
     ) -> Stretch:
-        """Lay out the samples of channels and the knots of latent forces over a span of time.
+        """Make a stretch from the samples of channels, with latent forces over a span of time.
 
-        ``channels``: stamps, shape (n,), values, shape (n, C), and their deviations, which
-        broadcast to the values; ``span``: [s]; ``start, start_sd``: guess of what is not known at
-        the start, and its deviation.
+        ``channels``: stamps, shape (n,), values, shape (n, C), and their standard deviations, which
+        broadcast to the values; ``span``: [s]; ``start, start_sd``: guess of the initial state, and
+        its standard deviation.
         """
         rows = []
         for number, (stamps, values, deviation) in enumerate(channels):
@@ -172,17 +168,19 @@ class NumericModel(Model, ABC):
         )
 
     def pushes_at(self, lanes: Lanes, shares: ndarray) -> ndarray:
-        """Return latent forces of lanes at shares of a window's span, shape (T, B, pushes)."""
+        """Return the latent forces of lanes at fractions of a window's span, shape (T, B,
+        pushes).
+        """
         weights = triangles(shares, np.linspace(0.0, 1.0, self.knot_count))
         latent = lanes.latent.reshape(len(lanes.latent), -1, self.knot_count)
         forces: ndarray = np.einsum("bpk,tk->tbp", latent, weights)
         return forces
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
-        """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws
-        act besides.
+        """Extend the model by a diagnosis: add sizes, from which further ones are counted and
+        bounded, and laws.
 
-        Raises LogError for a size outside its bounds, and a law that cannot act in this model.
+        Raises LogError for a size outside its bounds, and for a law that cannot act in this model.
         """
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
@@ -209,7 +207,7 @@ class NumericModel(Model, ABC):
             raise LogError(f"the law {term.formula} cannot act here: {reason}")
 
     def choose(self, names: Sequence[str]) -> None:
-        """Keep these effects alone. Raises DiagnoseError for one that it does not know."""
+        """Keep only these effects. Raises DiagnoseError for an unknown one."""
         by_name = {effect.name: effect for effect in self.effects}
         expect_known(names, by_name, "no effect '{}' for these logs", DiagnoseError)
         self.effects = tuple(by_name[name] for name in names)
@@ -225,15 +223,15 @@ class NumericModel(Model, ABC):
 
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
         """See the base class."""
-        if self._flown is None:  # its initial states follow from call to call
+        if self._flown is None:  # one copy, whose initial states are carried on between calls
             self._flown = copy(self)
         self._flown.laws = (*self.laws, *laws)
         return self._flown
 
     def simulate(self, lanes: Lanes) -> ndarray:
-        """Simulate lanes; returns the states on each one's grid, shape (B, T, S).
+        """Simulate lanes; return the states on their grids, shape (B, T, S).
 
-        Models without a state need not override it.
+        Models without a state need not override this.
         """
         return np.zeros((len(lanes.owner), 2, 0))
 
@@ -242,7 +240,7 @@ class NumericModel(Model, ABC):
         """Return the sensors' measurements in lanes of one stretch, shape (L, N)."""
 
     def knots(self, lanes: Lanes) -> list[Mapping[str, ndarray]]:
-        """Return quantities of laws at the knots of each stretch's latent forces; ``lanes``: one a
+        """Return the quantities for laws at the knots of each stretch; ``lanes``: one for each
         stretch.
         """
         knots = []
@@ -253,21 +251,21 @@ class NumericModel(Model, ABC):
         return knots
 
     def quantities(self, time: ndarray, state: ndarray) -> Mapping[str, ndarray]:
-        """Return quantities of laws outside the catalogue at states, shape (k, S); none by
+        """Return the quantities for laws outside the catalogue at states, shape (k, S); none by
         default.
         """
         return {}
 
     def exerted(self, block: str, state: ndarray) -> ndarray:
-        """Return what the model's laws exert in a latent block at states of lanes, shape (B, 3)."""
+        """Return the force or torque of the model's laws on a latent block, shape (B, 3)."""
         if not self.laws:
             return np.zeros((len(state), 3))
         return exerted(self.laws, self.quantities(np.zeros(len(state)), state))[block]
 
     def size(self, theta: Mapping[str, float]) -> ndarray:
-        """Sizes of all effects in order, with those it had before, shape (K,).
+        """Return the total sizes of all effects in order, shape (K,).
 
-        Raises LogError for an effect that it does not know.
+        Raises LogError for an unknown effect.
         """
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
         sizes = np.array([theta.get(name, 0.0) for name in self.numbers])
@@ -275,20 +273,20 @@ class NumericModel(Model, ABC):
         return total
 
     def of_windows(self, lanes: Lanes, name: str) -> ndarray:
-        """Return an entry of the windows' data, of one shape in all windows, a row for each
+        """Return an entry of the windows' data, which has one shape in all windows, for each
         lane.
         """
         values = np.array([s.data[name] for s in self.stretches])
         return np.take(values, lanes.owner, axis=0)
 
     def size_of(self, lanes: Lanes, name: str) -> ndarray:
-        """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
+        """Return the sizes of an effect, shape (B,); zeros if the catalogue lacks it."""
         if name not in self.numbers:
             return np.zeros(len(lanes.owner))
         return lanes.theta[:, self.numbers[name]]
 
     def stack(self, lanes: Lanes, *names: str) -> ndarray:
-        """Sizes of several effects, shape (B, N); zeros for an empty name."""
+        """Return the sizes of several effects, shape (B, N); zeros for an empty name."""
         return np.stack([self.size_of(lanes, name) for name in names], axis=1)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
@@ -324,21 +322,23 @@ class NumericModel(Model, ABC):
         return self._from_prior(self._settle(self.size(theta)))
 
     def _from_prior(self, residuals: list[ndarray]) -> list[ndarray]:
-        """Return residuals as with the unknowns in the middle of their prior, where that counts."""
+        """Extrapolate residuals to initial states at their prior means, if these count."""
         if not self.anchored:
             return residuals
         moves = [start - s.start for start, s in zip(self._start, self.stretches)]
         return [r + slope @ move for r, slope, move in zip(residuals, self._slopes, moves)]
 
     def _lanes(self, size: ndarray, start: ndarray | None = None) -> Lanes:
-        """One lane a stretch."""
+        """Return one lane for each stretch."""
         count = len(self.stretches)
         start = self._start if start is None else start
         latent = np.zeros((count, len(self.stretches[0].latent_block)))
         return Lanes(np.arange(count), np.tile(size, (count, 1)), start, latent)
 
     def _measured(self, lanes: Lanes) -> list[ndarray]:
-        """Return what lanes measure, (lanes of it, N) a stretch; all have as many, in turn."""
+        """Simulate the measurements of lanes, shape (L, N) for each stretch; all stretches have the
+        same number L of lanes, one stretch after the other.
+        """
         each = len(lanes.owner) // len(self.stretches)
         batch = max(1, MOST_LANES // each)
         measured = []
@@ -351,12 +351,12 @@ class NumericModel(Model, ABC):
         return measured
 
     def _off(self, size: ndarray, start: ndarray) -> list[ndarray]:
-        """Return the residuals of all stretches from states at their starts, shape (N,) each."""
+        """Return the residuals of all stretches from given initial states, shape (N,) each."""
         measured = self._measured(self._lanes(size, start))
         return [s.residual - only for s, (only,) in zip(self.stretches, measured)]
 
     def _settle(self, size: ndarray) -> list[ndarray]:
-        """Fit what is not known at the start, window by window; returns the residuals."""
+        """Fit the initial state of each window; return the residuals."""
         residuals = self._off(size, self._start)
         if not self._start.shape[1]:
             return residuals
@@ -383,7 +383,7 @@ class NumericModel(Model, ABC):
         return residuals
 
     def _aims(self, residuals: list[ndarray], start: ndarray) -> list[ndarray]:
-        """Return residuals, and behind them the way back to the prior's middle, in their
+        """Return residuals followed by the distances from the prior mean, in standard
         deviations.
         """
         aims = []
@@ -393,31 +393,32 @@ class NumericModel(Model, ABC):
         return aims
 
     def _newton(self, i: int, aim: ndarray) -> ndarray:
-        """Return the Gauss-Newton step of a window's unknowns; 0 where it promises little."""
+        """Return the Gauss-Newton step of a window's initial state; 0 if it would gain little."""
         s = self.stretches[i]
         none = np.zeros(len(s.start))
         prior = np.diag(1.0 / s.nuisance_sd)
         rows = np.concatenate([self._slopes[i] / s.sigma[:, None], prior])
         if not (np.all(np.isfinite(aim)) and np.all(np.isfinite(rows))):
-            return none  # no step mends that; the search says which window it is
+            return none  # the search drops this window and reports it
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]
         return step if 0.5 * aim @ rows @ step > SETTLED else none
 
     def _slopes_by_start(self, size: ndarray) -> list[ndarray]:
-        """Return the derivatives of the samples by what is not known at the start."""
+        """Return the derivatives of the samples by the initial states."""
         steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
         return self._slopes_by(size, "nuisance", steps, range(steps.shape[1]))
 
     def _slopes_by(
         self, size: ndarray, name: str, steps: ndarray, columns: Sequence[int]
     ) -> list[ndarray]:
-        """Return derivatives of the samples by central differences, (N, C) a stretch.
+        """Return the derivatives of the samples by central differences, shape (N, C) for each
+        stretch.
 
         Args:
             size: of the effects.
-            name: of the field of :class:`Lanes` that is moved.
-            steps: of its columns, for all stretches or each, shape (C,) or (S, C).
-            columns: those that are moved.
+            name: field of :class:`Lanes` that is varied.
+            steps: of its columns, for all stretches or for each, shape (C,) or (S, C).
+            columns: columns that are varied.
         """
         stretches = self.stretches
         count = len(columns)
@@ -438,22 +439,24 @@ class NumericModel(Model, ABC):
 
 
 def _costs(aims: list[ndarray]) -> ndarray:
-    """Return the sum of squares of each window; infinite where a simulation ran away."""
+    """Return the sum of squares of each window; infinite if a simulation diverged."""
     squares = np.array([aim @ aim for aim in aims])
     return np.where(np.isnan(squares), np.inf, squares)
 
 
 def sigma_of(channel: Channel, floor: float) -> ndarray:
-    """Noise of a channel's components as the samples show it.
+    """Estimate the noise of a channel's components from its samples.
 
-    ``floor``: below which none is believed; ten times that stands where too few samples tell.
+    ``floor``: smallest noise; ten times that is returned if there are too few samples.
     """
     estimate = noise(channel)
     return np.maximum(np.where(np.isfinite(estimate), estimate, 10.0 * floor), floor)
 
 
 def take_samples(channel: Channel, params: Any, start: float) -> tuple[ndarray, ndarray]:
-    """Return stamps and values of every n-th sample in a window of a model's parameters."""
+    """Return stamps and values of a window's samples, every n-th one; ``params``: window length and
+    n.
+    """
     inside = (channel.time >= start) & (channel.time < start + params.window)
     rows = np.flatnonzero(channel.valid & inside)[:: params.every]
     return channel.time[rows], channel.values[rows].astype(float).reshape(len(rows), -1)
@@ -483,10 +486,11 @@ def integrate(
     steps: int,
     step: ndarray | float,
 ) -> ndarray:
-    """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
+    """Integrate lanes by the classical fourth-order Runge-Kutta method; return their paths, shape
+    (B, steps + 1, S).
 
-    ``slope``: of the half step counted from the start, and the state; ``state``: at the start,
-    shape (B, S); ``step``: [s], of all lanes or of each, shape (B, 1)."""
+    ``slope``: function of the number of half steps since the start, and the state; ``state``: at
+    the start, shape (B, S); ``step``: [s], for all lanes or for each, shape (B, 1)."""
     path = np.empty((len(state), steps + 1, state.shape[1]))
     half = 0.5 * step
     path[:, 0] = state
@@ -500,5 +504,5 @@ def integrate(
 
 
 def triangles(time: ndarray, knots: ndarray) -> ndarray:
-    """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
+    """Return the weights of linear interpolation between knots, shape (T, knots)."""
     return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])
