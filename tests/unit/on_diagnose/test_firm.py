@@ -42,7 +42,7 @@ def test_of_what_flights_hardly_show_no_size_is_claimed():
     effects = (*EFFECTS[:7], weak, *EFFECTS[8:])
     diagnosis = explain_without_laws(world({"effect_05": 40.0}, effects=effects))
     assert diagnosis[weak.name].verdict == result.NOT_IDENTIFIABLE
-    assert "hardly more than was known" in diagnosis[weak.name].sentence
+    assert "hardly add to the prior" in diagnosis[weak.name].sentence
     assert diagnosis["effect_01"].verdict != result.NOT_IDENTIFIABLE
 
 
@@ -68,8 +68,8 @@ def contradict(monkeypatch, truth, same=(), **changes):
 @mark.parametrize(
     ("share", "low", "high", "verdict", "reason"),
     [
-        (0.4, -0.2, 1.0, result.CANDIDATE, "confirm effect_05 (they bear out 40 % [-20, 100]"),
-        (-0.1, -0.3, 0.1, result.NOT_IDENTIFIABLE, "are explained worse with effect_05"),
+        (0.4, -0.2, 1.0, result.CANDIDATE, "confirm effect_05 (they show 40 % [-20, 100]"),
+        (-0.1, -0.3, 0.1, result.NOT_IDENTIFIABLE, "are predicted worse with effect_05"),
     ],
 )
 def test_names_that_held_out_flights_do_not_confirm_are_none(
@@ -87,8 +87,8 @@ def test_the_test_that_failed_is_reported_with_the_flight_that_would_settle_it(m
     gain = replace(GAIN, after=0.019, gain=0.05, low=-0.1, high=0.2)
     diagnosis = contradict(monkeypatch, {"effect_05": 40.0}, channels=(gain,), folds=2)
     assert diagnosis["effect_05"].verdict == result.CANDIDATE
-    assert "no channel's error falls for sure: pos_w 5 % [-10, 20]" in diagnosis.reasons[0]
-    assert "fly once more, such as: swing" in diagnosis.reasons[0]
+    assert "no channel's error surely decreases: pos_w 5 % [-10, 20]" in diagnosis.reasons[0]
+    assert "fly once more, for example: swing" in diagnosis.reasons[0]
 
 
 def test_intervals_of_the_gain_hold_what_they_promise():

@@ -290,7 +290,7 @@ def test_an_interval_that_shrinks_onto_a_bound_is_reported_in_words():
     assert (finding.low, finding.high) == (0.0, 0.0)
     assert (
         finding.sentence
-        == "effect_03: on its bound of 0; these flights ask for less than is possible."
+        == "effect_03: on its bound of 0; these flights would need less than is possible."
     )
 
 

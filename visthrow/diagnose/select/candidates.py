@@ -135,7 +135,7 @@ def as_random(effect: Effect) -> RandomEffect:
     """Convert an effect into a random effect, whose size differs from flight to flight."""
     return RandomEffect(
         effect.name,
-        f"{effect.cause}, now more, now less",
+        f"{effect.cause}, varying between flights",
         f"{effect.name} ~ N({effect.name}, theta^2) in each flight",
         (effect.name,),
         effect.unit,

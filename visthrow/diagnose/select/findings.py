@@ -80,15 +80,12 @@ class Reading:
         low, high = (ends + 0.0).tolist()  # no -0
         finding = replace(finding, low=low, high=high)
         if j in self.withdrawn:
-            text = (
-                f"{effect.name}: explains a part of what is missing, but not its form; the name is"
-                " withdrawn."
-            )
+            text = f"{effect.name}: explains a part of the error, but not its form; withdrawn."
             return replace(finding, verdict=result.NOT_IDENTIFIABLE, sentence=text)
         unit = unit_suffix(effect.unit)
         if sd > BIT * priors.slab[j]:
             text = (
-                f"{effect.name}: these flights say hardly more than was known ({deviation:.2g} of"
+                f"{effect.name}: these flights hardly add to the prior ({deviation:.2g} of"
                 f" {effect.prior_sd:.2g}{unit})."
             )
             return replace(finding, verdict=result.NOT_IDENTIFIABLE, sentence=text)
@@ -97,7 +94,7 @@ class Reading:
             return finding
         comparison = "less" if size < low else "more"
         text = (
-            f"{effect.name}: on its bound of {low:.3g}{unit}; these flights ask for {comparison}"
+            f"{effect.name}: on its bound of {low:.3g}{unit}; these flights would need {comparison}"
             " than is possible."
         )
         return replace(finding, sentence=text)
@@ -157,7 +154,7 @@ class Reading:
         finding = replace(finding, estimate=size, low=low, high=high)
         text = f"{size:.3g} ± {finding.sd:.2g}{unit_suffix(finding.unit)}"
         if low <= 0.0 <= high:
-            sentence = f"{finding.cause}: {finding.name} = {text}, an interval that holds 0."
+            sentence = f"{finding.cause}: {finding.name} = {text}; the interval contains 0."
             return replace(finding, verdict=result.CANDIDATE, sentence=sentence)
         names = [self.point.problem.effects[k].name for k in members]
         partners = tuple(name for name in names if name != finding.name)
@@ -165,7 +162,7 @@ class Reading:
         if odds > POSSIBLE:
             which = " or ".join((finding.name, *partners))
             sentence = (
-                f"{finding.cause}: {finding.name} = {text} if it is there; sets of causes without"
+                f"{finding.cause}: {finding.name} = {text} if present; sets of causes without"
                 f" {which} explain these flights nearly as well (odds {odds:.2g})."
             )
             finding = replace(finding, partners=partners)

@@ -345,8 +345,8 @@ def _harm(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | 
     borne = share_text(measured.share, measured.low, measured.high)
     how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or borne
     names = ", ".join(diagnosis.theta)
-    reason = f"held-out {measured.left_out} are explained worse with {names} ({how}); withdrawn"
-    why = "held-out flights are explained worse with it"
+    reason = f"held-out {measured.left_out} are predicted worse with {names} ({how}); withdrawn"
+    why = "held-out flights are predicted worse with it"
     return Doubt(diagnosis.named, result.NOT_IDENTIFIABLE, why, reason)
 
 
@@ -375,8 +375,8 @@ def _disagreement(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
         alike = (name, *diagnosis[name].partners)
         if sum(measured.named_in.get(member, 0.0) for member in alike) < FIRM + 1e-9:
             unsure.append(name)
-    why = f"the search, repeated without some {measured.left_out}, does not always name it"
-    reason = f"searches that leave {measured.left_out} out do not agree on a name"
+    why = f"the search, repeated without some {measured.left_out}, does not always select it"
+    reason = f"searches that leave {measured.left_out} out do not select the same effects"
     return Doubt(unsure, why=why, reason=reason)
 
 
@@ -501,22 +501,22 @@ def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tu
 def share_text(share: float, low: float, high: float) -> str:
     """Return the result of :func:`borne_out` as a clause about held-out flights."""
     if np.isnan(low):
-        return "only one of them can tell"
+        return "only one of them is informative"
     return (
-        f"they bear out {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of what it promises"
+        f"they show {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of the predicted gain"
     )
 
 
 def _no_gain(measured: HeldOut) -> str:
     """Return the gains of all channels as text, none of which is certain."""
     gains = (f"{c.channel} {100 * c.gain:.0f} % {c.interval}" for c in measured.channels)
-    return f"no channel's error falls for sure: {', '.join(gains)}"
+    return f"no channel's error surely decreases: {', '.join(gains)}"
 
 
 def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     """Return the flight to be flown next, as text."""
     manoeuvres = list(dict.fromkeys(m for name in names for m in diagnosis[name].manoeuvres))
-    return f"fly once more{f', such as: {manoeuvres[0]}' if manoeuvres else ' like these'}"
+    return f"fly once more{f', for example: {manoeuvres[0]}' if manoeuvres else ' like these'}"
 
 
 def _remaining(c: ChannelGain, work: Work) -> str:
@@ -525,7 +525,7 @@ def _remaining(c: ChannelGain, work: Work) -> str:
     text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
     return (
-        f"{c.channel}: {text} left on held-out flights, noise alone"
+        f"{c.channel}: {text} remain on held-out flights, noise alone"
         f" {factor * c.floor:.3g}{f'; {kind}' if kind else ''}"
     )
 

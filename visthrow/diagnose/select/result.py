@@ -21,21 +21,21 @@ NAMED = (FOUND, CLASS, CANDIDATE)  # verdicts on selected effects
 NOT_IDENTIFIABLE = "NOT IDENTIFIABLE"
 UNOBSERVABLE = "UNOBSERVABLE"
 VERDICTS = {
-    FOUND: "the model lacks it, and nothing else in the catalogue says the same",
-    CLASS: "this or one of its partners; these flights cannot tell which",
+    FOUND: "the model lacks it, and nothing else in the catalogue explains the same",
+    CLASS: "this effect or one of its partners; these flights cannot tell which",
     CANDIDATE: (
-        "the flights ask for it, but held-out flights do not confirm it, the search does not"
-        " always name it without some of them, or sets of causes without it are nearly as likely"
+        "selected, but held-out flights do not confirm it, the search does not always select it"
+        " without some of them, or sets of causes without it are nearly as likely"
     ),
     BOUNDED: (
-        "the flights do not ask for it; if it is present all the same, then within these limits,"
+        "not needed to explain the flights; if present all the same, then within these limits,"
         " which need not include 0"
     ),
     NOT_IDENTIFIABLE: (
-        "these flights say hardly more than was known before, or it explains a part of what is"
-        " missing, but not its form"
+        "these flights hardly add to the prior, or it explains a part of the error, but not its"
+        " form"
     ),
-    UNOBSERVABLE: "a channel is missing that would show it",
+    UNOBSERVABLE: "a channel that would show it is missing",
 }
 """Verdicts on one effect; each effect has exactly one."""
 
@@ -47,14 +47,11 @@ INCONSISTENT = "DATA INCONSISTENT"
 OUT_OF_DOMAIN = "OUT OF DOMAIN"
 OVERALL = {
     NO_EFFECT: "the model explains the flights",
-    KNOWN: "the causes named explain the flights",
-    IN_PART: (
-        "the causes named explain a part of the flights, as held-out ones confirm; more is left"
-        " than noise"
-    ),
-    UNKNOWN: "something is missing that no cause of the catalogue is shown to explain",
-    INCONSISTENT: "the channels do not belong together; no cause can be named",
-    OUT_OF_DOMAIN: "the simulation cannot follow these flights; no cause can be named",
+    KNOWN: "the causes found explain the flights",
+    IN_PART: ("held-out flights confirm the causes found, but an error above the noise remains"),
+    UNKNOWN: "the model lacks something that no cause of the catalogue is shown to explain",
+    INCONSISTENT: "the channels contradict each other; no cause can be found",
+    OUT_OF_DOMAIN: "the simulation cannot follow these flights; no cause can be found",
 }
 
 

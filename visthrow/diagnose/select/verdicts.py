@@ -304,9 +304,9 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
             by_flight = best.point.plain.information[:, columns, columns].sum(axis=1)
             flight = best.point.plain.flights[np.argmax(by_flight)]
             return [], (
-                "a formula, which is not printed, explains these flights, but those that are left"
-                f" out do not repeat it: {share_text(share, low, high)}; flight {flight} shows it"
-                " most: fly more like that one"
+                "a formula, which is not printed, explains these flights, but held-out ones do not"
+                f" repeat it: {share_text(share, low, high)}; flight {flight} shows it most: fly"
+                " more like that one"
             )
     return repeated, ""
 
@@ -372,7 +372,7 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
     )
     findings = []
     for e in model.effects:
-        text = f"{e.name}: nothing can be said, the simulation does not follow these flights."
+        text = f"{e.name}: not identifiable, as the simulation does not follow these flights."
         finding = replace(blank(e), manoeuvres=(), sentence=text)
         findings.append(replace(finding, verdict=result.NOT_IDENTIFIABLE))
     flights = len({w.flight for w in windows})
@@ -414,9 +414,9 @@ def _contradiction(selection: Selector) -> Answer | None:
     if not strong:
         return None
     reason = (
-        f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are"
-        f" missing in the phases {', '.join(strong)}: commands and poses, units or axes do not"
-        " belong together"
+        f"with the best causes of the catalogue, forces above {INEXACT:.0%} of the thrust are still"
+        f" missing in the phases {', '.join(strong)}: commands and poses, units or axes contradict"
+        " each other"
     )
     return result.INCONSISTENT, "", [reason], set(selection.best.columns)
 
@@ -432,7 +432,7 @@ def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
         unit = unit_suffix(law.unit)
         texts.append(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit}")
     verb = "explains" if len(texts) == 1 else "together explain"
-    reason = f"{' and '.join(texts)} {verb} what no cause of the catalogue does"
+    reason = f"{' and '.join(texts)} {verb} what no cause of the catalogue explains"
     blocks = terms.acts_in(c.law for c in forms)
     return result.UNKNOWN, forms[0].law, [reason, *reasons], _parts_of(selection, blocks)
 
@@ -463,7 +463,7 @@ def _answer_crowded(selection: Selector, reasons: Sequence[str]) -> Answer | Non
         unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
         if len(members) * selection.threshold > law and unlike.min() < 0.5:
             names = ", ".join(selection.problem.effects[j].name for j in members)
-            reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
+            reason = f"{names} act on the {block} and some hardly differ: another law is likelier"
             return result.UNKNOWN, block, [*reasons, reason], set(members)
     return None
 
@@ -483,8 +483,8 @@ def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
         return None
     names = ", ".join(selection.problem.effects[j].name for j in by_block[block])
     reason = (
-        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names}:"
-        " the true cause has another equation"
+        f"{formula}, with some function f, explains {nats:.0f} nats beyond {names}: the true cause"
+        " has another equation"
     )
     return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
 

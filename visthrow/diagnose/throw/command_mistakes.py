@@ -49,7 +49,7 @@ class Mistake:
         """Describe the mistake and its correction for the report."""
         return (
             f"{self.cause}: {self.name}, {self.equation}; {self.nats:.0f} nats from {self.logs}"
-            " logs. It was put right."
+            " logs. It was corrected."
         )
 
     def mended(self, log: FlightLog) -> FlightLog:
