@@ -132,10 +132,10 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
         return f"flight {flight} differs from the others in {', '.join(differs)}"
     if flight in {w.flight for w in diagnosis.work.after.windows}:
         return (
-            f"something happened in flight {flight} that the rest of its phase does not show; there"
-            " the flight weighs little"
+            f"a part of flight {flight} is far rougher than the rest of its phase, and has less"
+            " weight"
         )
-    return f"something happened in flight {flight} that the others do not show; it was left out"
+    return f"flight {flight} contains a disturbance that the others do not; it was left out"
 
 
 def instead(diagnosis: Diagnosis) -> list[str]:

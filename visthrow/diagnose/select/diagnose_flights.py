@@ -196,7 +196,9 @@ def _select(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]
     lossy_selection = Selector(start, needed, plain.progress, plain.laws).run(begin)
     cost = needed + sum(lost_commands.divergence(of, share.size) for of in lost)
     gain = lossy_selection.value - cost - plain.value
-    plain.progress(f"commands got lost: {share.size:.1%} of them, {gain:.1f} nats ahead")
+    plain.progress(
+        f"{share.size:.1%} of commands were lost: {gain:.1f} nats better than without losses"
+    )
     if gain <= 0.0:
         return plain, None
     return lossy_selection, share

@@ -171,7 +171,7 @@ class Reading:
             digits = 0 if finding.nats >= 10.0 else 1
             sentence = (
                 f"{finding.cause}: {finding.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
-                f" {finding.nats:.{digits}f} nats; another flight may differ by"
+                f" {finding.nats:.{digits}f} nats; expected standard deviation between flights"
                 f" {finding.differs:.2g}."
             )
             return replace(finding, verdict=result.FOUND, sentence=sentence)

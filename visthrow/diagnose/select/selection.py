@@ -446,7 +446,7 @@ class Selector:
         ranked = sorted(listed.items(), key=lambda item: -item[1])[:REPORTED_SETS]
         screened = {names_of(s): float(gain) for s, gain in ranked}
         name = names_of(top.chosen)
-        self.progress(f"{name}: {top.lead:.1f} nats ahead")
+        self.progress(f"{name}: {top.lead:.1f} nats better than before")
         self.steps.append(SelectionStep(name, top.lead, screened, nats))
 
     def _propose(self) -> bool:
