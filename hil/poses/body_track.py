@@ -1,4 +1,4 @@
-"""One tracked body: frames, gate, filter and age, from raw poses to a state at a time."""
+"""Track one body: from raw poses, through frames, gate and filter, to its state at a time."""
 
 import math
 from collections import deque
@@ -28,7 +28,7 @@ CALM_SAMPLES = 20
 
 @dataclass(frozen=True)
 class BodyState:
-    """State of a body in our frames, at the time that it stands for."""
+    """State of a body in our frames at one time."""
 
     pos: Vector  # [m], world frame
     quat: Quaternion | None  # body to world, xyzw
@@ -38,8 +38,11 @@ class BodyState:
 
 
 class Track:
-    """Follows one body with a ``gate``, which counts what was refused, and a ``filter``;
-    ``accepted`` counts poses taken, ``stream`` judges how they come.
+    """Tracks one body.
+
+    Attributes:
+        gate: accepts or refuses poses, and counts the refused ones. filter: estimates velocities.
+        accepted: number of accepted poses. stream: judges rate and regularity.
     """
 
     def __init__(
@@ -68,10 +71,10 @@ class Track:
         self._pose = None
 
     def update(self, raw: Pose, tether: Tether | None = None) -> str | None:
-        """Take a raw pose; why it was refused, or None.
+        """Process a raw pose; return why it was refused, or None.
 
-        ``tether``: the cable's other end, where one hangs. A body whose attitude nobody needs may
-        have none.
+        ``tether``: the cable's other end, if the payload is attached. A body whose rate is not
+        needed may lack an attitude.
         """
         reason = self._taken(raw, tether)
         self.stream.note(raw, reason)
@@ -99,12 +102,12 @@ class Track:
         return None
 
     def settle(self) -> None:
-        """Work out now what a state would work out when it is asked for."""
+        """Compute now what :meth:`state` would otherwise compute at its first call."""
         if self._turns:
             _ = self.filter.rate
 
     def expected(self, time: float) -> Vector | None:
-        """Return where the last pose and velocity put the body at a time of arrival [s]; None
+        """Predict the position at a time of arrival [s] from the last pose and velocity; None
         before the first pose.
         """
         pose = self._pose
@@ -113,8 +116,8 @@ class Track:
         return plus(pose.pos, self._vel, time - pose.arrival)
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
-        """Return the last pose, its stamp freed of clock steps, with velocity and body rate; raises
-        `ValueError` where there is none.
+        """Return the last pose, its stamp corrected for clock steps, with velocity and body rate;
+        raises `ValueError` before the first pose.
         """
         if self._pose is None:
             raise ValueError("no pose was taken yet; sample() is for after the first one")
@@ -125,8 +128,8 @@ class Track:
         )
 
     def calm_speed(self) -> float:
-        """Return the speed by a line through the last poses [m/s]: late, but free of noise;
-        infinite with too few of them.
+        """Return the speed from a line fitted to the last poses [m/s]: delayed, but with little
+        noise; infinite if there are too few.
         """
         if len(self._slow) < CALM_SAMPLES:
             return math.inf
@@ -137,8 +140,8 @@ class Track:
         )
 
     def state(self, time: float, lead: float = 0.0) -> BodyState | None:
-        """Return the state at a time [s] by the last accepted pose, carried ahead [s] with part of
-        what is known of its accelerations.
+        """Extrapolate the last accepted pose to a time [s], plus ``lead`` [s], with part of the
+        estimated accelerations; None before the first pose.
         """
         pose = self._pose
         if pose is None:
