@@ -159,7 +159,7 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
 def _replayable(path: Path) -> dict[str, Any]:
     """Return config of a run without what only reads the recording's source: its poses are here,
     and its form has changed before. Keys that are newer than the run have their shipped values; a
-    run from before the aim holds no release back.
+    run from before the aim holds no release back, one from before the probe commands none.
     """
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -168,12 +168,16 @@ def _replayable(path: Path) -> dict[str, Any]:
             f"{path}: cannot be read: {error}; expected the config of a run"
         ) from error
     tree.pop("against", None)
+    noise = tree.get("camera", {}).get("noise", {})
+    if "seen_radius" in noise:
+        noise["visible_radius"] = noise.pop("seen_radius")
     tree["source"] = {
         key: value
         for key, value in tree.get("source", {}).items()
         if key not in ("columns", "time")
     }
-    return {"aim": None} | tree | {"base": BASE}
+    check = {"probe": 0.0} | tree.get("check", {})
+    return {"aim": None} | tree | {"check": check, "base": BASE}
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:

@@ -82,8 +82,10 @@ def test_a_run_with_its_poses_apart_and_without_later_keys_replays(run_folder, t
     config = tmp_path / "before" / "config.toml"
     tree = tomllib.loads(config.read_text())
     del tree["aim"], tree["check"]["probe"]
+    tree["camera"]["noise"]["seen_radius"] = tree["camera"]["noise"].pop("visible_radius")
     config.write_text(dumps(tree))
-    assert load_run(tmp_path / "before")[0].aim is None
+    settings = load_run(tmp_path / "before")[0]
+    assert (settings.aim, settings.check.probe) == (None, 0.0)
     ticks = list(lines(run_folder / "ticks.jsonl"))
     poses = [[line["n"], *row] for line in ticks for row in line["poses"]]
     former = [line | {"poses": len(line["poses"])} for line in ticks]
@@ -122,13 +124,8 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
     (first / "link.tlog").write_bytes(b"of the first run")
     refused(f"hil run --out {first} --set {device}", message="holds a run already")
     assert (first / "link.tlog").read_bytes() == b"of the first run"
-    late = [
-        "--config",
-        "fake_betaflight",
-        "--set",
-        "betaflight.device=tcp:127.0.0.1:9",
-    ]  # no listener
-    refused(f"hil run --out {tmp_path}/new --set {device}", *late, message="cannot connect")
+    late = "--config fake_betaflight --set betaflight.device=tcp:127.0.0.1:9"  # no listener
+    refused(f"hil run --out {tmp_path}/new --set {device} {late}", message="cannot connect")
     assert not (tmp_path / "new").exists()
 
 
@@ -210,10 +207,9 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused, printe
     assert "FAIL  all was well for the last " in printed(
         "hil check --config mine.toml --seconds 1.2", *HOLD, status=1
     )
-    wrong = ["--config", "mine.toml", "--set", "check.heading_deg=90.0"]
-    assert main(["hil", "check", *wrong]) == 1
-    assert "FAIL  heading" in capsys.readouterr().out
-    assert "throws 0" in printed("hil record --set states.check=0.5 --out looked", *wrong), (
+    wrong = "--config mine.toml --set check.heading_deg=90.0"
+    assert "FAIL  heading" in printed(f"hil check {wrong}", status=1)
+    assert "throws 0" in printed(f"hil record {wrong} --set states.check=0.5 --out looked"), (
         "recorded to the end although the checks fail"
     )
     assert len(load_run("looked")[2]) == len(ticks)
@@ -225,7 +221,6 @@ def test_a_run_whose_poses_cease_in_flight_is_packed_and_fails(tmp_path, monkeyp
     rows = CSV.splitlines(keepends=True)
     (tmp_path / "poses.csv").write_text("".join([*rows[:220], rows[-1]]))
     (tmp_path / "mine.toml").write_text(MAPPING)
-    command = ["hil", "run", "--config", "mine.toml", "--set", "observe=false", "--out", "run"]
-    assert main(command) == 1
+    assert run_command("hil run --config mine.toml --set observe=false --out run") == 1
     assert "run.zip  the run in one file" in capsys.readouterr().out
     assert (tmp_path / "run.zip").is_file()
