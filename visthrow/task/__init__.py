@@ -2,8 +2,8 @@
 
 SI units.
 
-One experiment file of ``configs/train`` names the files of vehicle, rope, camera and task and holds
-the learning parameters; :func:`plant_of` gives what the simulator needs of it."""
+An experiment file of ``configs/train`` names the files of vehicle, rope, camera and task and holds
+the learning parameters. :func:`plant_of` returns the part that the simulator needs."""
 
 import math
 import statistics
@@ -37,15 +37,15 @@ Share = Annotated[float, Bound(0.0, 1.0, "(]")]
 MAX_RATE = (10.0, 10.0, 4.0)
 """Body rates that a 3-inch quadrotor follows well [rad/s]; not in the paper."""
 AIR_DENSITY = 1.2  # at 20 degrees [kg/m^3]
-SOUND = 343.0  # speed of sound in it [m/s]
+SOUND = 343.0  # speed of sound in this air [m/s]
 
 
 @dataclass(frozen=True)
 class ActionParams(Bounded):
     """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
-    # body rates at +-1 [rad/s] and collective thrust at +1 [N]; an experiment replaces 0 by its
-    # vehicle's
+    # body rates at +-1 [rad/s] and collective thrust at +1 [N]; an experiment replaces 0 by the
+    # vehicle's value
     max_rate: NotNegativeVector = (0.0, 0.0, 0.0)
     max_thrust: NotNegative = 0.0
 
@@ -55,26 +55,26 @@ class ObservationParams(Bounded):
     """The actor's observations; see :mod:`visthrow.onboard.observations`."""
 
     layout: Literal["state", "vision"]
-    history: int  # earlier payload measurements beside the current one
+    history: int  # number of earlier payload measurements besides the current one
     validity: bool  # vision: whether the actor observes which keypoints are valid
-    # age of all that is measured, drawn per episode from this range [s]
+    # age of all measurements, drawn per episode from this range [s]
     latency: tuple[float, float]
-    # of that age, uniform up to this to either side, drawn per step [s]
+    # largest deviation from this age to either side, uniform, drawn per step [s]
     latency_jitter: NotNegative = 0.0
-    # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
+    # whether the actor observes a fit of the goal's velocity; see visthrow.onboard.goal_motion
     goal_velocity: bool = False
-    # whether the actor is given the mean goal of all steps, and in vision where the payload's
-    # keypoints lie; see visthrow.onboard.goal_motion
+    # whether the actor observes the mean goal of all steps, and in vision the positions of the
+    # payload's keypoints; see visthrow.onboard.goal_motion
     located: bool = False
-    # earlier steps of which the actor is given velocity, body rates and action: how this vehicle
-    # answers
+    # number of earlier steps whose velocity, body rates and action the actor observes: they show
+    # the vehicle's response
     response: int = 0
-    # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
+    # properties of a fleet's vehicle that the actor observes; see visthrow.task.fleet
     setup: Literal["none", "given", "exact"] = "none"
 
     @property
     def oldest(self) -> float:
-        """Age of the oldest sample that may be measured [s]."""
+        """Return the age of the oldest possible measurement [s]."""
         return self.latency[1] + self.latency_jitter
 
     def __post_init__(self) -> None:
@@ -94,9 +94,8 @@ class ObservationParams(Bounded):
 
 @dataclass(frozen=True)
 class NoiseParams(Bounded):
-    """Gaussian noise of measurements and commands (the paper, Sec.
-
-    III-C). Keypoints have their own in the camera.
+    """Gaussian noise of measurements and commands; the camera's parameters hold the keypoints'
+    noise. Source: the paper, Sec. III-C.
     """
 
     observation_step: NotNegative  # per step, in each entry's SI unit
@@ -107,12 +106,12 @@ class NoiseParams(Bounded):
 
 @dataclass(frozen=True)
 class BoundsParams(Bounded):
-    """Ends of an episode (the paper, Sec. III-C); the numbers are ours."""
+    """Bounds that end an episode (the paper, Sec. III-C); the numbers are ours."""
 
     altitude: tuple[float, float]  # of the vehicle [m]
     horizontal: Positive  # distance of the vehicle from the spawn axis [m]
     tilt_deg: Positive  # between body z and the vertical [deg]
-    time_limit: Positive  # a negative end, never bootstrapped [s]
+    time_limit: Positive  # a failure, never bootstrapped [s]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,11 +124,9 @@ class BoundsParams(Bounded):
 
 @dataclass(frozen=True)
 class RewardParams(Bounded):
-    """Coefficients of Table II, by the names of its meanings; see
-    :mod:`visthrow.task.rewards`.
-    """
+    """Coefficients of Table II, named by their meanings; see :mod:`visthrow.task.rewards`."""
 
-    scale: float  # of the whole reward; the learner's only, the paper's is 1
+    scale: float  # factor of the whole reward, for the learning algorithm; the paper's is 1
     velocity: float  # alpha_v
     angular_velocity: float  # alpha_omega
     relative_velocity: float  # alpha_p
@@ -147,8 +144,8 @@ class RewardParams(Bounded):
 
 @dataclass(frozen=True)
 class TargetParams(Bounded):
-    """Motion of the target: a constant horizontal velocity, its heading uniform; the landing counts
-    where it is at impact.
+    """Motion of the target: a constant horizontal velocity with a uniform heading. Landing errors
+    refer to the target's position at impact.
     """
 
     # uniform in this range, drawn per episode [m/s]
@@ -163,7 +160,7 @@ class TargetParams(Bounded):
 
     @property
     def moves(self) -> bool:
-        """Whether any target does."""
+        """Return whether targets move."""
         return self.speed[1] > 0.0
 
 
@@ -193,7 +190,7 @@ PRIVILEGED = (
     "pose_age",
     "vehicle",
 )
-"""What a critic may observe beyond the actor's observation; see
+"""Quantities that a critic may observe besides the actor's observation; see
 :class:`visthrow.training.env.ThrowEnv`.
 """
 
@@ -214,27 +211,27 @@ class PPOParams(Bounded):
     learning_rate: Positive
     schedule: Literal["adaptive", "fixed"]
     desired_kl: Positive  # at the first iteration
-    final_kl: Positive  # once settled; linear between
+    final_kl: Positive  # after the share settled; linear in between
     discount: Share
     gae_lambda: Share
     clip: Positive
     entropy: NotNegative
     value_coefficient: NotNegative
     max_grad_norm: Positive
-    # of the hidden layers; weights are float32 either way
+    # number format of products in the hidden layers; weights are always float32
     products: Literal["float32", "bfloat16"] = "float32"
     settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
-    # most rope segments that training simulates, with the solver chain; 0 for the plant's number
+    # largest number of rope segments in training, with the solver chain; 0 for the plant's number
     segments: Annotated[int, Bound(0)] = 0
-    # shortest step that training simulates, with the solver chain; 0 for the plant's [s]
+    # shortest simulation step in training, with the solver chain; 0 for the plant's [s]
     substep: NotNegative = 0.0
-    # whether PPO's weight matrices step along their orthogonalised momentum, as those of first
-    # order and distillation always do; see visthrow.training.ppo.network.MuonAdam
+    # whether PPO optimises weight matrices by Muon, as first_order and distillation always do; see
+    # visthrow.training.ppo.network.MuonAdam
     muon: bool = False
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
-    # iterations at the beginning in which the critic alone learns
+    # number of first iterations in which only the critic learns
     critic_first: Annotated[int, Bound(0)] = 0
-    # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
+    # inputs of only the critic, from PRIVILEGED; those that a task does not have are omitted
     privileged: tuple[str, ...] = PRIVILEGED[:8]
 
     def __post_init__(self) -> None:
@@ -250,33 +247,34 @@ class PPOParams(Bounded):
 
 @dataclass(frozen=True)
 class FirstOrderParams(Bounded):
-    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` has the throws a
-    gradient and the network.
+    """Learning parameters of :mod:`visthrow.training.first_order`; ``ppo`` determines the number of
+    throws for a gradient, and the network.
     """
 
-    iterations: Count = 1000  # gradients
-    horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    segments: Count = 5  # as ppo.segments
-    substep: Positive = 0.004  # as ppo.substep [s]
-    decay: Positive = 0.985  # of derivatives, per step backward
+    iterations: Count = 1000  # gradient steps
+    horizon: int = 48  # length of a flight [control steps]; the latch trips near the 35th
+    segments: Count = 5  # see ppo.segments
+    substep: Positive = 0.004  # see ppo.substep [s]
+    decay: Positive = 0.985  # factor on derivatives, per step backward
     learning_rate: Positive = 2e-3  # at the first iteration
-    adapting: Count = 160  # gradients where the training starts from a policy
-    adapting_rate: Positive = 2e-4  # at the first of them, a tenth of it at the last
-    adapting_width: float = 0.15  # of the hazard in them
-    final_rate: Positive = 5e-5  # at the last one; half a cosine between
+    adapting: Count = 160  # gradient steps of a training that starts from a policy
+    adapting_rate: Positive = 2e-4  # learning rate at the first of them; a tenth at the last
+    adapting_width: float = 0.15  # width of the hazard in them
+    final_rate: Positive = 5e-5  # learning rate at the last iteration; half a cosine in between
     max_grad_norm: Positive = 1.0
     width: Positive = 0.5  # of the hazard at the first iteration, in units of the fifth action
     final_width: Positive = 0.35  # at most the first
-    # share of the training after which the width is the final one; geometric till then
+    # share of the training after which the width is the final one; geometric before
     sharp: Positive = 0.3
     # shares of the training between which the hazard's value becomes the latch's
     latched: tuple[float, float] = (0.1, 0.2)
-    # step before which nothing is released at the beginning: else the payload is dropped at once
+    # first step with a release at the start of training; without it the payload would be dropped
+    # at once
     first_release: int = 24
-    # shares of the training between which that step comes down to 0
+    # shares of the training between which this step falls to 0
     free: tuple[float, float] = (0.05, 0.15)
     initial_release: float = -2.0  # fifth action of the untrained network
-    saturation: float = 1.0  # cost of the square that an action is past its limits by
+    saturation: float = 1.0  # cost of the squared excess of an action over its limits
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -295,34 +293,34 @@ class FirstOrderParams(Bounded):
 
 @dataclass(frozen=True)
 class DistillationParams(Bounded):
-    """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` has the
-    throws of an iteration.
+    """Learning parameters of :mod:`visthrow.training.distillation`; ``ppo.environments`` is the
+    number of throws in an iteration.
     """
 
     teacher: str = "state"  # state policy: a shipped name or a file
     iterations: Count = 500
-    horizon: Count = 72  # of a throw [control steps]
-    hidden: Count = 256  # of the encoder's first layer
-    inner: Counts = ()  # of its further layers
-    memory: Count = 128  # of the recurrent unit
+    horizon: Count = 72  # longest throw [control steps]
+    hidden: Count = 256  # width of the encoder's first layer
+    inner: Counts = ()  # widths of its further layers
+    memory: Count = 128  # size of the recurrent unit's state
     epochs: Count = 1
     minibatches: Count = 4
     learning_rate: Positive = 2e-3  # at the first iteration
-    final_rate: NotNegative = 5e-5  # at the last one; half a cosine between
-    action_weight: NotNegative = 0.3  # of what an error of the estimate does to the action
+    final_rate: NotNegative = 5e-5  # at the last one; half a cosine in between
+    action_weight: NotNegative = 0.3  # weight of the action's error in the loss
 
 
 @dataclass(frozen=True)
 class DiagnosedParams(Bounded):
-    """The uncertainty of the plant after a diagnosis (``visthrow diagnose apply`` writes it).
+    """The uncertainty of the plant after a diagnosis, written by ``visthrow diagnose apply``.
 
-    Training draws ``plants`` plants from the joint posterior: deviations theta of the effects,
-    normal with this covariance about the configuration as it stands, so that what is pinned
-    together stays so. Environment e flies plant ``e % plants``. With 1 all fly the configuration.
+    Training draws ``plants`` plants from the joint posterior: the deviations of the effects are
+    normal with this covariance about the configuration, so that their correlations are kept.
+    Environment e flies plant ``e % plants``. With 1 all environments fly the configuration.
     """
 
-    effects: tuple[str, ...] = ()  # of the catalogue
-    covariance: tuple[tuple[float, ...], ...] = ()  # of their deviations, in their units
+    effects: tuple[str, ...] = ()  # names in the catalogue
+    covariance: tuple[tuple[float, ...], ...] = ()  # of the deviations, in the effects' units
     plants: Count = 1
 
     def __post_init__(self) -> None:
@@ -335,7 +333,7 @@ class DiagnosedParams(Bounded):
 
 @dataclass(frozen=True)
 class Experiment:
-    """All that a training run depends on; written beside its results."""
+    """The complete configuration of a training run; written beside its results."""
 
     vehicle: VehicleParams
     rope: RopeParams
@@ -345,14 +343,14 @@ class Experiment:
     task: TaskParams
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
-    laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
-    # of the motion capture; the diagnosis alone reads it
+    laws: tuple[LawParams, ...] = ()  # laws from a diagnosis, in addition to those of the blocks
+    # sensing by motion capture; only the diagnosis reads it
     sensing: SensingParams = field(default_factory=SensingParams)
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
-    # with it, policies are trained for many vehicles; task and sim are in its units
+    # if set, policies are trained for many vehicles, and task and sim are in the fleet's units
     fleet: FleetParams | None = None
     flown: tuple[
         str, ...
@@ -360,12 +358,12 @@ class Experiment:
 
     @property
     def iterations(self) -> int:
-        """Iterations of a whole training."""
+        """Return the number of iterations in a whole training."""
         return self._chosen.iterations
 
     @property
     def samples(self) -> int:
-        """Environment steps an iteration."""
+        """Return the number of environment steps in an iteration."""
         chosen = self._chosen
         return self.ppo.environments * (
             chosen.steps if isinstance(chosen, PPOParams) else chosen.horizon
@@ -397,11 +395,11 @@ class Experiment:
 
 
 def _largest_rates(vehicle: VehicleParams) -> Vector:
-    """Return the largest body rates that a vehicle is commanded [rad/s].
+    """Return the largest body rates to command to a vehicle [rad/s].
 
-    They are at most those that a 3-inch quadrotor follows well. A rate error of the largest rate
-    asks for at most half of the motors' range: beyond that the mixer saturates, and the collective
-    thrust no longer follows its command.
+    They are at most :data:`MAX_RATE`. A rate error as large as the largest rate demands at most
+    half of the motors' range: beyond that the mixer saturates, and the collective thrust no longer
+    follows its command.
     """
     controller = vehicle.controller
     rotors = vehicle.rotors
@@ -419,8 +417,8 @@ def _largest_rates(vehicle: VehicleParams) -> Vector:
 
 
 def _find_wrong_units(e: Experiment) -> Iterator[str]:
-    """Return the contradiction among an experiment's lengths: a number in another unit is
-    off by a hundred or more.
+    """Yield contradictions among an experiment's lengths and times, which a number in a wrong unit
+    causes.
     """
     start = e.task.start
     bounds = e.task.bounds
@@ -447,8 +445,8 @@ def _find_wrong_units(e: Experiment) -> Iterator[str]:
 
 
 def _find_impossible_vehicle(e: Experiment) -> Iterator[str]:
-    """Return the reason why an experiment's vehicle is impossible: thrust and weight, size, thrust
-    and speed of the rotors.
+    """Yield reasons why an experiment's vehicle is impossible: weight above the thrust, size, speed
+    of the rotors.
     """
     vehicle = e.vehicle
     rotors = e.vehicle.rotors
@@ -481,7 +479,7 @@ def _find_impossible_vehicle(e: Experiment) -> Iterator[str]:
 def load_experiment(name: str | Path, changes: Iterable[str] = ()) -> Experiment:
     """Load a configuration of ``configs/train`` or a TOML file, with changes ``key=value``.
 
-    Raises ConfigError: there is none, or a change is wrong.
+    Raises ConfigError: no such file exists, or a change is invalid.
     """
     return config.load(Experiment, config.find("train", name), changes)
 
@@ -502,10 +500,10 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     """Return the conditions that a flight must share with a policy's training; see
     :mod:`visthrow.onboard.policy`.
 
-    The camera enters for vision policies only. Noise and randomisation are training matters and
-    stay out. An entry whose field has a default enters where it differs from that: a policy from
-    before the field was there fits what it is off in. ``whole``: every entry that a contract may
-    have, for any observation and plant."""
+    The contract of a vision policy includes the camera. No contract includes noise and
+    randomisation, which only concern training. A field with a default is included if its value
+    differs from the default, so that a policy from before the field existed fits the default.
+    ``whole``: include every entry that a contract can have, for any observation and plant."""
     from visthrow.onboard.observations import layout_of
     from visthrow.onboard.pilot import camera_conditions
 
@@ -526,7 +524,7 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     contract |= {key: acting[key] for key in ("air", "laws") if key in acting}
     if whole or task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
-    # for any vehicle: conditions of one are not the policy's
+    # a fleet's policy is for any vehicle: the conditions of a single one do not apply
     if experiment.fleet is not None and not whole:
         contract["fleet"] = {
             "rope_length": experiment.fleet.rope_length,
@@ -542,11 +540,11 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
 
 
 def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
-    """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or
-    nothing is uncertain.
+    """Return ``diagnosed.plants`` plants drawn about the experiment's plant; only the latter if the
+    number is 1 or no effect is uncertain.
 
-    A draw that the effects' physical bounds forbid is put on the bound. ConfigError for a
-    covariance that is none."""
+    A draw outside an effect's physical bounds is moved to the bound. Raises ConfigError: the
+    covariance is not symmetric or has a negative eigenvalue."""
     diagnosed = experiment.diagnosed
     plant = plant_of(experiment)
     if diagnosed.plants == 1 or not diagnosed.effects:

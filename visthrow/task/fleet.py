@@ -1,19 +1,19 @@
 """Experiments with a fleet: one policy for any vehicle of a class.
 
 The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of
-``fleet.total_mass``. Every vehicle is flown in units in which its own have these numbers
-(:mod:`sim.scaling.units`): the same task for all, targets, fence and rewards too, and control steps
-that are as long as the square root of the rope. What stays different is what makes vehicles
-different.
+``fleet.total_mass``. Every vehicle is flown in units in which its rope length and mass have these
+values (:mod:`sim.scaling.units`). In these units the task is the same for all vehicles, including
+targets, bounds and rewards; the control period in seconds grows with the square root of the rope
+length. The remaining differences are the real differences between vehicles.
 
 A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the
-lens is twice as far from its middle, and the square on the ground twice as wide. The ball has its
-own size.
+lens is twice as far from the vehicle's centre, and the square on the ground is twice as wide. The
+ball's radius is the vehicle's own.
 
-The actor is given a vehicle's set-up, ``given``: the throttle that holds it in hover, the share of
-what hangs in the total mass, the lag of the release, and the unit of time [s], by which links and
-sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which is unknown on board: an upper
-bound, and the critic's input."""
+With the set-up ``given`` the actor observes the throttle in hover, the share of rope and payload in
+the total mass, the lag of the release, and the unit of time [s], which determines the latencies of
+links and sensors. ``exact`` adds :data:`HIDDEN`, which is unknown on board: it serves as an upper
+bound and as the critic's input."""
 
 import math
 from dataclasses import dataclass
@@ -56,7 +56,7 @@ HIDDEN = (
     "payload_offset",
     "mount.2",
 )
-"""Numbers of vehicle and rope that the actor does not observe."""
+"""Parameters of vehicle and rope that the actor does not observe."""
 
 
 @dataclass(frozen=True)
@@ -68,18 +68,18 @@ class Member:
 
     @property
     def max_thrust(self) -> float:
-        """Collective thrust of an action of +1, in these units."""
+        """Return the collective thrust of an action of +1, in these units."""
         return 4.0 * self.plant.vehicle.controller.max_thrust
 
     @property
     def first_action(self) -> list[float]:
-        """Action of hover."""
+        """Return the action that holds the vehicle in hover."""
         return act.hover_action(GRAVITY * self.plant.total_mass, self.max_thrust)
 
     @property
     def given_setup(self) -> list[float]:
-        """Set-up that is known of it: throttle in hover, share of what hangs, lag, unit of time
-        [s].
+        """Return the properties that are known on board: throttle in hover, share of rope and
+        payload in the mass, lag of the release, unit of time [s].
         """
         plant = self.plant
         return [
@@ -91,7 +91,7 @@ class Member:
 
     @property
     def exact(self) -> list[float]:
-        """Set-up with the hidden numbers, as logarithms."""
+        """Return the known properties and the logarithms of the hidden ones."""
         return [*self.given_setup, *(math.log(abs(self._number(path))) for path in HIDDEN)]
 
     def _number(self, path: str) -> float:
@@ -100,18 +100,19 @@ class Member:
         else:
             value = self.plant.rope
         for part in path.split("."):
-            value = value[int(part)] if part.isdigit() else getattr(value, part)  # type: ignore[index]
+            # type: ignore[index]
+            value = value[int(part)] if part.isdigit() else getattr(value, part)
         return float(value)  # type: ignore[arg-type]
 
     def setup(self, kind: str) -> list[float]:
-        """Return the set-up of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
+        """Return the properties of a kind in :data:`visthrow.onboard.observations.SETUPS`."""
         return {"none": [], "given": self.given_setup, "exact": self.exact}[kind]
 
 
 def members(experiment: Experiment) -> list[Member]:
-    """Vehicles that the experiment's fleet flies; none without a fleet.
+    """Return the vehicles of the experiment's fleet; none without a fleet.
 
-    The height of landing and the margin of the clearance belong to the task: they are in its units
+    The landing height and the clearance margin belong to the task, so they are in its units
     already."""
     fleet = experiment.fleet
     if fleet is None:
@@ -132,8 +133,8 @@ def members(experiment: Experiment) -> list[Member]:
 
 
 def single_vehicle(experiment: Experiment, number: int = 0) -> Experiment:
-    """Return the experiment of one vehicle of the fleet, stated in SI units, vehicle and task
-    alike; no fleet any more.
+    """Return the experiment of one vehicle of the fleet, with vehicle and task in SI units and
+    without a fleet.
     """
     chosen = members(experiment)[number]
     inverse_units = chosen.units.inverse
@@ -160,12 +161,12 @@ def single_vehicle(experiment: Experiment, number: int = 0) -> Experiment:
 def specialise(
     policy: Policy, experiment: Experiment, number: int = 0
 ) -> tuple[Policy, Experiment]:
-    """Policy for one vehicle of the fleet that the policy was trained for: an ordinary one, in SI
-    units, and its experiment.
+    """Convert a fleet's policy to a policy for one vehicle in SI units; return it and its
+    experiment.
 
-    Units go into the normaliser, the vehicle's set-up into the first layer's bias: nothing on board
-    knows that it was for many. Raises PolicyError: the policy is none for many vehicles, or it
-    observes what only a simulator knows of one."""
+    The units are absorbed by the normaliser, and the vehicle's properties by the first layer's
+    bias, so on board it is like any other policy. Raises PolicyError: the policy was not trained
+    for a fleet, or it observes properties that only a simulator knows."""
     observation = policy.contract.get("observation", {})
     if (
         "fleet" not in policy.contract
@@ -203,7 +204,7 @@ def specialise(
 
 
 def _sizes(layout: ob.Layout, units: Units) -> torch.Tensor:
-    """Size in SI units of each entry of an observation without the set-up, shape (D,)."""
+    """Return the SI unit of each entry of an observation without the set-up, shape (D,)."""
     length = units.length
     speed = units.length / units.time
     rate = 1.0 / units.time

@@ -1,9 +1,9 @@
-"""The paper's measurement: throws from hover at targets ahead, scored by where and when the payload
-lands.
+"""The paper's measurement: throws from hover at targets in front, scored by landing error and
+duration.
 
-Landing error is the horizontal distance of the landing point from the goal, duration the time from
-the policy's start to the landing (Sec. IV-A). A throw succeeds when the payload was released and
-landed; one that ends otherwise has no landing error and counts against the success rate."""
+The landing error is the horizontal distance of the landing point from the goal. The duration is the
+time from the policy's start to the landing (Sec. IV-A). A throw succeeds if the payload was
+released and landed. Otherwise it has no landing error and lowers the success rate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,19 +15,19 @@ from sim.params import RandomizationParams
 from visthrow import config
 from visthrow.task import Experiment
 
-TARGETS = (1.5, 2.0, 2.5)  # targets along x [m]; the last lies outside the training distribution
+TARGETS = (1.5, 2.0, 2.5)  # targets along x [m]; the last is outside the training distribution
 
-LANDED = 0.95  # share of throws that must land before their mean error says anything of a policy
+LANDED = 0.95  # share of throws that must land for their mean error to be meaningful
 
 
 def pilots_hover() -> RandomizationParams:
-    """Return the variation of starts in a pilot's hover, ``configs/start/hover.toml``."""
+    """Return the variation of initial states in a hover, ``configs/start/hover.toml``."""
     return config.load(RandomizationParams, config.find("start", "hover"))
 
 
 def hover_start(experiment: Experiment) -> Experiment:
-    """Return the experiment with its episodes started from hover; cables and payloads vary as in
-    the experiment.
+    """Return the experiment with episodes that start from hover; cables and payloads still vary as
+    the experiment specifies.
     """
     fields = (
         "tether_variants",
@@ -43,7 +43,9 @@ def hover_start(experiment: Experiment) -> Experiment:
 
 
 def as_flown(experiment: Experiment) -> Experiment:
-    """Return the experiment as its policies are flown and measured: without training's faults."""
+    """Return the experiment with the changes in ``flown``, under which its policies are flown and
+    measured: without the faults of the training.
+    """
     if not experiment.flown:
         return experiment
     values = config.to_dict(experiment)
@@ -52,7 +54,7 @@ def as_flown(experiment: Experiment) -> Experiment:
 
 
 def blank_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:
-    """Return columns, a row a throw, with NaN in the rows of failed throws."""
+    """Return columns, one row for each throw, with NaN in the rows of failed throws."""
     blank = np.where(success, 1.0, np.nan)
     return {name: (blank * values.T).T for name, values in columns.items()}
 
@@ -69,17 +71,19 @@ class Throws:
     clearance: ndarray  # [m], shape (N,)
     # root mean square change of the normalised commands from step to step, shape (N,)
     smoothness: ndarray
-    # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
+    # position of a moving goal at impact [m], shape (N, 2); None if goals do not move
     goal_w: ndarray | None = None
 
     def land_within(self, error: float) -> bool:
-        """Whether they land so near on average [m], and all but one in twenty land."""
+        """Return whether the mean error is at most ``error`` [m] and a share of at least
+        :data:`LANDED` lands.
+        """
         return (
             bool(self.success.mean() >= LANDED) and float(self.error[self.success].mean()) <= error
         )
 
     def summary(self) -> dict[str, float]:
-        """Mean and deviation of the successful throws, with the success rate."""
+        """Return means and standard deviations of the successful throws, and the success rate."""
         if not self.success.any():
             return {"target": self.target, "throws": len(self.success), "success": 0.0}
         good = self.success
@@ -104,8 +108,8 @@ class Throws:
 
 @dataclass(frozen=True)
 class Entry:
-    """One row's thrower: what it is called, what it sees ("state", "vision") or is, and its throws
-    a target.
+    """One row of a comparison: the thrower's name, its layout of observations ("state", "vision")
+    or its kind, and its throws for each target.
     """
 
     name: str

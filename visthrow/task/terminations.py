@@ -1,4 +1,4 @@
-"""Ends of a throw, for an episode of training and for a flight on any plant.
+"""Conditions that end a throw, in training episodes and in flights on any plant.
 
 The functions take and return tensors or NumPy arrays over the batch, shape (E,) or (E, 3).
 
@@ -19,7 +19,9 @@ Array = TypeVar("Array", Tensor, np.ndarray)
 
 
 def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
-    """Vehicle outside the altitude or the horizontal bounds. pos_w: [m], shape (E, 3)."""
+    """Return message -> whether the vehicle is outside a bound of position, shape (E,).
+    pos_w: [m], shape (E, 3).
+    """
     height = pos_w[:, 2]
     low, high = p.altitude
     outside = (height < low) | (height > high)
@@ -38,14 +40,14 @@ def ends_while_carrying(
     time: Array | float,
     landing_height: float,
 ) -> dict[str, Array]:
-    """Return the ends of a throw before the latch trips; the payload on the ground is not in the
-    paper, whose bounds leave it open.
+    """Return message -> whether a throw ends before the latch trips, shape (E,). The paper does not
+    state that a payload on the ground ends the throw.
 
     Args:
-        p, landing_height: bounds; [m].
+        p: bounds. landing_height: [m].
         pos_w, payload_w: [m], shape (E, 3). upright: vertical component of the body's z axis, shape
             (E,).
-        time: since the start [s], shape (E,) or one for all.
+        time: time since the start [s], shape (E,) or one number for all.
     """
     steepest = math.cos(math.radians(p.tilt_deg))
     return {
@@ -66,12 +68,13 @@ def negative(
     time: Tensor,
     landing_height: float,
 ) -> Tensor:
-    """All negative ends of an episode.
+    """Return whether an episode ends in a failure, shape (E,), bool.
 
-    Once the latch has tripped only collision, a bad state and leaving the bounds end one early.
+    After the latch has tripped only a collision, a non-finite state or leaving the bounds is a
+    failure.
 
     Args:
-        p, pos_w, payload_w, time, landing_height: as of :func:`ends_while_carrying`.
+        p, pos_w, payload_w, time, landing_height: see :func:`ends_while_carrying`.
         rot_wb: shape (E, 3, 3).
         status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """

@@ -1,12 +1,12 @@
-"""A vision policy with a memory, distilled from a state policy: an estimator learns what the state
-policy looks at.
+"""Distil a state policy into a vision policy with memory: a recurrent network learns to estimate
+the state policy's observation.
 
-The state policy decides; in place of its observation it is given the estimate that a recurrent
-network makes of all that a vision policy has seen (:mod:`visthrow.onboard.estimator`). The network
-flies from the first iteration on, and is fitted by regression to the exact observation on the
-states that it meets (DAgger: Ross et al., AISTATS 2011), with backpropagation through the whole
-throw. Throws that the exact observation flies would teach it to read the truth out of the action
-before."""
+The network estimates this observation from the history of vision observations
+(:mod:`visthrow.onboard.estimator`), and the state policy acts on the estimate. From the first
+iteration on, the throws are flown with the network's estimates, and the network is fitted by
+regression to the exact observations of the states that it visits (DAgger: Ross et al., AISTATS
+2011), with backpropagation through the whole throw. If the throws were flown with exact
+observations, the network would learn to infer the state from the previous action."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -30,26 +30,30 @@ from visthrow.training.ppo.network import MuonAdam, average_weights, cosine_rate
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 1.0, 0.01, 0.005, 1.0)
-"""Errors of equal weight: of position [m], velocity [m/s], body rates [rad/s], rotation [-],
-action, goal and payload offsets [m], latch.
+"""Errors that count equally in the loss: position [m], velocity [m/s], body rates [rad/s],
+rotation [-], action, goal and payload offsets [m], latch.
 """
 
-AVERAGED = 100  # gradient steps that the exported weights are a mean of, at most
+AVERAGED = 100  # longest window of gradient steps over which the exported weights are averaged
 
-# iterations in which the observations' mean and spread are taken; from there they stand still
+# iterations that determine the observations' mean and spread, which are then constant
 WATCHED = 50
 
 
 class EstimatorNetwork(nn.Module):
-    """The estimator as it is trained; see :class:`visthrow.onboard.estimator.Estimator` for its
+    """The estimator during training; :class:`visthrow.onboard.estimator.Estimator` describes its
     parts and shapes.
     """
 
     def __init__(self, passed: Tensor, learnt: Tensor, width: int, p: DistillationParams):
-        """Begin with an estimate of what is kept: the entry of the observation that each estimate
-        corrects, ``width`` for none, shape (S,).
+        """Initialise the network so that its estimates are nearly the entries that it corrects.
 
-        ``learnt``: which estimates are learnt, bool, shape (S,). width: D. p: sizes.
+        Args:
+            passed: index of the observation's entry that each estimate corrects, ``width`` for
+                none, shape (S,).
+            learnt: whether an estimate is learnt, bool, shape (S,).
+            width: number D of entries of the observation.
+            p: sizes of the layers.
         """
         super().__init__()
         widths = (p.hidden, *p.inner)
@@ -65,7 +69,7 @@ class EstimatorNetwork(nn.Module):
         self.register_buffer("learnt", learnt.float())
 
     def freeze(self) -> Estimator:
-        """Return the estimator that flies; it shares the parameters."""
+        """Return the estimator for flight, which shares this network's parameters."""
         gru = self.gru
         normaliser = self.normalizer
         parts = [normaliser.mean, normaliser.std + normaliser.eps]
@@ -78,12 +82,12 @@ class EstimatorNetwork(nn.Module):
 
     @property
     def matrices(self) -> list[Tensor]:
-        """Weights of all layers but the last."""
+        """Return the weight matrices of all layers except the last."""
         layers = (self.encoder, *self.inner, self.gru)
         return [w for layer in layers for w in layer.parameters() if w.dim() == 2]
 
     def forward(self, obs: Tensor) -> Tensor:
-        """Estimates, shape (T, E, S), along throws, shape (T, E, D)."""
+        """Return estimates, shape (T, E, S), for the observations of throws, shape (T, E, D)."""
         x = F.elu(self.encoder(self.normalizer(obs)))
         for layer in self.inner:
             x = F.elu(layer(x))
@@ -95,7 +99,8 @@ class Distillation(Algorithm):
     """Distillation of a state policy.
 
     Attributes:
-        teacher: the state policy. network: what is fitted.
+        teacher: the state policy.
+        network: the estimator that is fitted.
     """
 
     parts = ("network", "average", "optimizer")
@@ -143,8 +148,8 @@ class Distillation(Algorithm):
 
     @torch.no_grad()
     def _fly(self) -> None:
-        """Fly one batch from new starts and record observations, true states, and the length of
-        each throw.
+        """Fly one batch from new starts; record observations, exact state observations, and which
+        throws are still in progress.
         """
         env = self.env
         policy = self.teacher
@@ -189,7 +194,9 @@ class Distillation(Algorithm):
         return figures | self.env.episode_means()
 
     def _step(self, rows: Tensor) -> Tensor:
-        """Take one gradient step on these throws; return their mean error in :data:`SCALES`."""
+        """Take one gradient step on the throws of these indices; return their mean error in units
+        of :data:`SCALES`.
+        """
         truth = self._truth[:, rows]
         alive = self._alive[:, rows]
         estimate = self.network(self._obs[:, rows])
@@ -197,7 +204,7 @@ class Distillation(Algorithm):
         off = F.smooth_l1_loss(scaled, truth / self._scales, reduction="none").mean(-1)
         target = act.clip_action(self.teacher.decide(truth))
         action = self.teacher.decide(estimate)
-        # beyond the limits only the way back counts
+        # both actions are clipped: past a limit, the gradient is zero or points back
         wrong = (act.clip_action(action) - target).detach()
         acted = (wrong * action).sum(-1)
         count = alive.sum()
@@ -211,8 +218,8 @@ class Distillation(Algorithm):
         return (alive * off).sum().detach() / count
 
     def _refresh(self) -> None:
-        """Take the network's state into what flies, in place: a captured rollout reads these
-        tensors.
+        """Copy the network's state into the estimator that flies, in place, because a captured
+        rollout reads these tensors.
         """
         flying = self._flying.parts()
         for name, value in self.network.freeze().parts().items():
@@ -228,7 +235,8 @@ class Distillation(Algorithm):
         e = policy.estimator
         n = self.network
         parts = e.parts()
-        taken = n.freeze().parts()  # the network's own memory, but for the masked output's
+        # shares the network's memory, except for the masked output layer
+        taken = n.freeze().parts()
         if {k: v.shape for k, v in parts.items()} != {k: v.shape for k, v in taken.items()}:
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"
@@ -241,8 +249,8 @@ class Distillation(Algorithm):
 
 
 def _map_entries(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
-    """Which entry of a vision observation each entry of a state observation corrects, and which of
-    these are learnt.
+    """Return the entry of the vision observation that each estimated entry of a state observation
+    corrects, shape (S,), and whether the estimate is learnt, bool, shape (S,).
     """
     known = ob.VEHICLE + 5
     columns = torch.full((state.dimension,), vision.dimension)
@@ -251,7 +259,7 @@ def _map_entries(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
         columns[known : known + 2] = torch.tensor(vision.columns("located")[:2])
     columns[-1:] = torch.tensor(vision.columns("attached"))
     learnt = torch.ones(state.dimension, dtype=torch.bool)
-    # the action before and the latch are known
+    # the previous action and the latch are known
     learnt[ob.VEHICLE : known] = False
     learnt[-1] = False
     return columns, learnt

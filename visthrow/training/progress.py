@@ -1,4 +1,4 @@
-"""Progress of a training run: printed lines, and a CSV row an iteration."""
+"""Record the progress of a training run: printed lines, and one CSV row for each iteration."""
 
 import csv
 import io
@@ -34,10 +34,10 @@ SAID_EVERY = 25  # iterations between two lines
 
 
 class TrainLog:
-    """Open log of one run, to be used as a context manager.
+    """The log of one run, used as a context manager.
 
-    A resumed run keeps the rows up to its checkpoint and drops later ones, a torn last row
-    included: they are made again."""
+    A resumed run keeps the rows up to its checkpoint. It drops later rows and an incomplete last
+    row, because it repeats these iterations."""
 
     def __init__(
         self, path: Path, samples: int, last: int, done: int = 0, minutes: float | None = None
@@ -45,9 +45,11 @@ class TrainLog:
         """Open the CSV file.
 
         Args:
-            path, samples: environment steps an iteration.
-            last, done: iteration that the run ends at, and those that a resumed run has behind it.
-            minutes: that it may take, where they are limited.
+            path: the CSV file.
+            samples: environment steps in each iteration.
+            last: the run's last iteration.
+            done: iterations that a resumed run had finished before.
+            minutes: limit of the run's duration; None if unlimited.
         """
         self.samples = samples
         self.last = last
@@ -77,13 +79,14 @@ class TrainLog:
                 raise
 
     def row(self, figures: dict, throws: Throws | None = None) -> None:
-        """Write one iteration's figures and, where it ended in throws, what came of them; OSError
-        where the disk is full.
+        """Write one iteration's figures and, if it was evaluated, the results of its throws.
+
+        Raises OSError: the disk is full.
         """
         elapsed = time.perf_counter() - self._start
         figures = figures | {"wall_s": self._before + elapsed}
         if throws is not None:
-            result = throws.summary()  # has no error where none landed
+            result = throws.summary()  # without an error if no throw landed
             figures |= {
                 "error_2m": result.get("error_mean", math.nan),
                 "duration_2m": result.get("duration_mean", math.nan),
@@ -107,7 +110,7 @@ class TrainLog:
             print(text, flush=True)
 
     def _remaining(self, iteration: int, elapsed: float) -> float:
-        """Time to the last iteration or the end of the minutes at the speed so far [s]."""
+        """Return the time to the last iteration, at the speed so far, or to the limit [s]."""
         remaining = (self.last - iteration) * elapsed / max(iteration - self.done, 1)
         if self.minutes is None:
             return remaining
@@ -120,7 +123,7 @@ def _writer(file: TextIO) -> csv.DictWriter:
 
 
 def _rows(path: Path, done: int) -> list[dict]:
-    """Return the whole rows of a log up to an iteration."""
+    """Return the complete rows of a log up to an iteration."""
     rows = []
     with path.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):

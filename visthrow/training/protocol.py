@@ -1,5 +1,5 @@
-"""The paper's measurement in the training simulator: throws from hover, scored as
-:mod:`visthrow.task.measurement` says.
+"""Make the paper's measurement in the training simulator: throws from hover, scored by
+:mod:`visthrow.task.measurement`.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,17 @@ def throw(
     build: Callable[..., ThrowEnv] = ThrowEnv,
     begin: Callable[[ThrowEnv], TensorDict] = ThrowEnv.reset,
 ) -> Throws:
-    """Throw ``count`` times in the training simulator, with all its noise, as one batch, at a
-    target [m] along x.
+    """Throw ``count`` times in the training simulator, with all its noise, as one batch.
 
     Args:
         experiment: its start is replaced by :func:`~visthrow.task.measurement.hover_start`.
         policy: function of observations (E, D) -> actions (E, 5), on the device.
-        target, count, device, seed: of starts and noise; torch's generators are put back
-            afterwards.
-        build: makes the environment, as the class does.
-        begin: brings it to where the throws begin and returns what is observed there.
+        target: distance along x [m].
+        count: number of throws.
+        device: "cpu" or "cuda:0".
+        seed: seed of starts and noise; torch's generators are restored afterwards.
+        build: builds the environment, with the class's arguments.
+        begin: brings the environment to the start of the throws; returns the observations there.
     """
     devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices), torch.inference_mode():

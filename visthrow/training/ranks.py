@@ -1,6 +1,4 @@
-"""The processes of one training, a GPU or a share of the cores each: what they agree on and what
-they share.
-"""
+"""Communicate between the processes of one training, each on a GPU or on a share of the cores."""
 
 import gc
 import os
@@ -11,12 +9,12 @@ import torch
 from rsl_rl.utils import reduce_gradients_in_buckets
 from torch import distributed, nn
 
-BUCKET_MB = 64.0  # gradients that are averaged at once [MB]
+BUCKET_MB = 64.0  # size of the gradients that one call averages [MB]
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among those of its training; the default is a training in one process."""
+    """One process of a training; by default the only one."""
 
     device: str = "cpu"  # or "cuda:0"
     rank: int = 0  # of this process
@@ -36,18 +34,18 @@ class Ranks:
 
     @property
     def lead(self) -> bool:
-        """Whether this process evaluates, reports and writes."""
+        """Return whether this process evaluates, reports and writes."""
         return self.rank == 0
 
     @property
     def rsl_rl(self) -> dict | None:
-        """rsl_rl's ``multi_gpu`` dictionary."""
+        """Return rsl_rl's ``multi_gpu`` dictionary; None for a single process."""
         if self.world > 1:
             return {"global_rank": self.rank, "local_rank": self.local, "world_size": self.world}
         return None
 
     def share(self, *modules: nn.Module) -> None:
-        """Give every process the first one's weights and buffers."""
+        """Copy the first process's weights and buffers to every process."""
         if self.world > 1:
             for module in modules:
                 for tensor in module.state_dict().values():
@@ -59,7 +57,7 @@ class Ranks:
             reduce_gradients_in_buckets(parameters, self.world, BUCKET_MB)
 
     def agree(self, number: int) -> int:
-        """Highest of the processes' numbers."""
+        """Return the highest of the processes' numbers."""
         if self.world == 1:
             return number
         tensor = torch.tensor(number, device=self.device)
@@ -67,16 +65,16 @@ class Ranks:
         return int(tensor)
 
     def gather(self, state: dict) -> list[dict]:
-        """Every process' state, in the order of ranks; of use to the lead alone."""
+        """Return the states of all processes in the order of ranks; only valid in the lead."""
         states = [state] * self.world
         if self.world > 1:
             distributed.gather_object(state, states if self.lead else None)
         return states
 
     def leave(self) -> None:
-        """Part from the others.
+        """Leave the process group.
 
-        No CUDA graph with collectives may be left: NCCL would wait for it for ever.
+        No CUDA graph with collectives may exist any more: NCCL would wait for it forever.
         """
         if self.world > 1:
             gc.collect()

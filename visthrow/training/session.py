@@ -1,8 +1,8 @@
-"""A training from its beginning or a checkpoint to its policy: log, evaluations on the way,
-checkpoints, an orderly stop.
+"""Run a training from its start or from a checkpoint, with a log, evaluations and checkpoints.
 
-It stops at its last iteration, at a requested error, by the clock, or at Ctrl-C and SIGTERM. Each
-stop leaves ``policy.npz``, ``checkpoint.pt`` and ``progress.csv`` in the folder of the run."""
+A training stops after its last iteration, at a requested error, at a time limit, or on Ctrl-C and
+SIGTERM. In each case ``policy.npz``, ``checkpoint.pt`` and ``progress.csv`` remain in the folder of
+the run."""
 
 import contextlib
 import json
@@ -32,15 +32,15 @@ from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, adopt_lay
 EVALUATION_TARGET = 2.0  # [m]
 
 
-# shares of the wall time that each may take where the command does not say how often
+# shares of the wall time that each may take if the command does not state a period
 EVALUATION_SHARE = 0.05
 CHECKPOINT_SHARE = 0.01
 
-FIRST = 20.0  # time after which the first of them comes then: what it costs is not known before [s]
+FIRST = 20.0  # time of the first of each [s], as its duration is not known before
 
 
 def run(args: Namespace) -> int:
-    """Train with the arguments of ``visthrow train``; returns the exit status of the command."""
+    """Train with the arguments of ``visthrow train``; return the exit status of the command."""
     _check(args)
     path = config.find("train", args.config) if args.config else None
     folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
@@ -49,7 +49,7 @@ def run(args: Namespace) -> int:
     name = compute_device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
-    # refuses what cannot be trained before a folder is made
+    # raises ConfigError for an unsupported experiment before a folder is created
     trainer = Trainer(experiment, ranks.device, seed, ranks)
     if args.resume:
         trainer.load(folder / CHECKPOINT)
@@ -69,7 +69,7 @@ def run(args: Namespace) -> int:
     if ranks.lead:
         _report(args, trainer, folder, time.perf_counter() - start, finished)
     iteration = trainer.iteration
-    del trainer  # its captured graphs hold the processes' communicator
+    del trainer  # its captured graphs hold the process group's communicator
     ranks.leave()
     if finished:
         return 0
@@ -85,7 +85,7 @@ def run(args: Namespace) -> int:
 
 
 def _check(args: Namespace) -> None:
-    """Refuse words that contradict each other, with a TrainError."""
+    """Raise TrainError for arguments that contradict each other."""
     if args.until is not None and args.until >= EVALUATION_TARGET:
         raise TrainError(
             f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error"
@@ -100,8 +100,9 @@ def _check(args: Namespace) -> None:
 
 
 def _begin(args: Namespace, path: Path, folder: Path) -> tuple:
-    """Experiment, policy to start from or None, and seed of a new run; StorageError where the
-    folder holds one already.
+    """Return the experiment, the policy to start from or None, and the seed of a new run.
+
+    Raises StorageError: the folder holds a run already.
     """
     seed = 1 if args.seed is None else args.seed
     provenance.check_free(folder)
@@ -113,8 +114,9 @@ def _begin(args: Namespace, path: Path, folder: Path) -> tuple:
 
 
 def _resume(args: Namespace, path: Path | None, folder: Path) -> tuple:
-    """Experiment, None and seed of the run in the folder; CheckpointError where there is none, or
-    what is named contradicts it.
+    """Return the experiment, None and the seed of the run in the folder.
+
+    Raises CheckpointError: the folder holds no checkpoint, or the arguments contradict it.
     """
     if not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")
@@ -144,33 +146,31 @@ DONE, REACHED, OUT_OF_TIME, STOPPED = ENDS = (
     "the time is over",
     "stopped",
 )
-"""Why a loop ended."""
+"""Reasons why a training stopped."""
 
 STOPPING = "\nstopping after this iteration"
 
 
 class Regularly:
-    """The schedule of a periodic task: every so many iterations, or as often as a share of the wall
-    time allows.
+    """The schedule of a periodic task, with a period in iterations or a limit on its share of the
+    wall time.
     """
 
     def __init__(self, period: int | None, share: float):
-        """Begin; ``period``: iterations, None leaves it to the clock; ``share``: of the wall time
-        then.
-        """
+        """Start the clock; ``period``: iterations, None to use the ``share`` of the wall time."""
         self._every = period
         self._share = share
         self._next = time.perf_counter() + FIRST
 
     def due(self, iteration: int) -> bool:
-        """Whether to do it after this iteration."""
+        """Return whether the task is due after this iteration."""
         if self._every:
             return iteration % self._every == 0
         return time.perf_counter() > self._next
 
     @contextlib.contextmanager
     def measure_cost(self) -> Iterator[None]:
-        """Measure how long the block takes, and plan the next one by it."""
+        """Measure the duration of the block and schedule the next one accordingly."""
         begin = time.perf_counter()
         yield
         end = time.perf_counter()
@@ -178,9 +178,10 @@ class Regularly:
 
 
 def _loop(args: Namespace, trainer, folder: Path, last: int) -> str:
-    """Train with log, evaluation and checkpoints, the last one at the end; return why it ended.
+    """Train with log, evaluations and checkpoints, the last one at the end; return the reason of
+    the stop, one of :data:`ENDS`.
 
-    TrainError where a file cannot be written; what the last checkpoint holds is not lost.
+    Raises TrainError: a file cannot be written; the last checkpoint remains.
     """
     deadline = time.perf_counter() + 60.0 * (args.minutes or math.inf)
     saved = trainer.iteration
@@ -227,7 +228,7 @@ def _loop(args: Namespace, trainer, folder: Path, last: int) -> str:
 
 
 def _line(throws: Throws) -> str:
-    """Return a target's landing error with its 95 % interval, in words."""
+    """Return a line of text with a target's landing error and its 95 % interval."""
     row = throws.summary()
     if not row["success"]:
         return f"target {row['target']:.1f} m: no throw landed"
@@ -239,8 +240,8 @@ def _line(throws: Throws) -> str:
 
 
 def _compare(name: str | None, rows: list[dict]) -> None:
-    """Print how a training's landing error compares with that of recorded seeds, where there are
-    any of its configuration.
+    """Compare a training's landing error with those of recorded seeds of its configuration, if any,
+    and print the result.
     """
     recorded = tables_beside(__file__, "recorded.toml").get(name)
     errors = [row.get("error_mean") for row in rows if row["target"] == EVALUATION_TARGET]
@@ -254,7 +255,7 @@ def _compare(name: str | None, rows: list[dict]) -> None:
 
 
 def _report(args: Namespace, trainer, folder: Path, wall: float, finished: bool) -> None:
-    """Throw at all targets, write the policy with what came of it, and print it."""
+    """Throw at all targets, write the policy with the results, and print these."""
     throws = trainer.final_throws()
     rows = [one.summary() for one in throws["flown"]]
     steps = trainer.iteration * trainer.algorithm.samples

@@ -1,4 +1,4 @@
-"""A training run: one algorithm, its evaluation, checkpoints that hold all state, and the trained
+"""Run one training: iterations of an algorithm, evaluations, checkpoints, and the trained
 policy.
 """
 
@@ -33,28 +33,27 @@ CHECKPOINT = "checkpoint.pt"
 POLICY = "policy.npz"
 SUMMARY = "summary.json"
 EVALUATION = "evaluation.json"
-"""Of a run's folder: the last iteration's state, the policy, the figures of a run that came to its
-end, and of one that did not.
+"""Files in a run's folder: state after the last iteration, policy, figures of a finished run, and
+figures of a run that was stopped.
 """
 
-# override that puts the schedule of a training from a policy in the place of the configuration's
-# own
+# override that replaces the configuration's schedule in a training that starts from a policy
 ADAPTATION = 'ppo="ppo/adapt.toml"'
 
-EVALUATED = 200  # throws of an evaluation
-EVALUATION_SEED = 12345  # of its starts and noise
-FINAL = 5  # times as many at the end of a training
+EVALUATED = 200  # throws in an evaluation
+EVALUATION_SEED = 12345  # seed of its starts and noise
+FINAL = 5  # the evaluation at the end of a training has so many times more throws
 
 TASK = ("observation", "action", "control_period")
-"""Parts of a policy's contract that its network cannot do without; plant, camera and release may
-differ from its training's.
+"""Parts of a policy's contract on which its network depends; plant, camera and release may differ
+from those of its training.
 """
 
 
 def coarsen(experiment: Experiment) -> Experiment:
-    """Return the experiment with fewer rope segments and longer steps, to train in: throws land
-    alike and are simulated faster. Other engines keep theirs: their ropes may be unstable in longer
-    steps.
+    """Return the experiment with fewer rope segments and longer steps for a faster training, in
+    which throws land at nearly the same places. With other engines than ``chain`` the experiment is
+    unchanged, as their ropes may be unstable in longer steps.
     """
     if experiment.sim.solver != "chain":
         return experiment
@@ -68,11 +67,11 @@ def coarsen(experiment: Experiment) -> Experiment:
 
 
 def adopt_layers(experiment: Experiment, policy: Policy) -> Experiment:
-    """Return the experiment with the policy's layers as its actor's, for a training that starts
-    from the policy.
+    """Return the experiment with the policy's layers for the actor, for a training that starts from
+    the policy.
 
-    MismatchError where the experiment's task observes or acts otherwise; the message names every
-    difference."""
+    Raises MismatchError: the task's observations or actions differ from the policy's; the message
+    names every difference."""
     try:
         follow_vehicle = ("observation.latency", "action.max_thrust", "action.max_rate")
         policy.require(contract_of(experiment), TASK, follow_vehicle)
@@ -93,19 +92,19 @@ def adopt_layers(experiment: Experiment, policy: Policy) -> Experiment:
 
 
 FINITE = {"value", "surrogate", "entropy", "spread", "cost", "gradient_norm"}
-"""Figures of an iteration that a training stops at when they are not finite."""
+"""Figures of an iteration that stop the training if they are not finite."""
 
 
 class Trainer:
     """One training run.
 
     Attributes:
-        algorithm: what learns. iteration: iterations done.
-        seconds: wall time spent in rollouts and in learning since the start or the resume.
+        algorithm: the training algorithm. iteration: number of finished iterations.
+        seconds: wall time of rollouts and of learning since the start or the resume [s].
     """
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks | None = None):
-        """Build the algorithm; the seed is that of everything random."""
+        """Build the algorithm and seed all random generators."""
         ranks = ranks or Ranks(device)
         seed_of_rank = seed * 1000 + ranks.rank
         torch.manual_seed(seed_of_rank)
@@ -126,7 +125,7 @@ class Trainer:
 
     @rounded_products(True)
     def step(self) -> dict[str, float]:
-        """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and
+        """Run one iteration; return losses, the finished episodes' means, ``rollout_s`` and
         ``learning_s`` [s].
         """
         start = time.perf_counter()
@@ -146,7 +145,7 @@ class Trainer:
         return figures | times | {"iteration": self.iteration}
 
     def _check_losses(self, figures: dict[str, float]) -> None:
-        """Raise TrainError where a loss or spread is not finite, in any process."""
+        """Raise TrainError if a loss or spread is not finite in any process."""
         broken = [
             f"{name} {figures[name]}"
             for name in FINITE & figures.keys()
@@ -170,8 +169,8 @@ class Trainer:
 
         Args:
             target: distance along x [m].
-            count: of throws.
-            experiment: conditions of the throws (default: those of the training).
+            count: number of throws.
+            experiment: conditions of the throws; default those of the training.
         """
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
         conditions = experiment or self.experiment
@@ -180,10 +179,11 @@ class Trainer:
         )
 
     def final_throws(self) -> dict[str, list[Throws]]:
-        """Throw :data:`FINAL` times :data:`EVALUATED` at each target, by conditions.
+        """Throw :data:`FINAL` times :data:`EVALUATED` at each target; return the throws by
+        conditions.
 
-        ``flown`` are the conditions that ``visthrow compare`` flies, ``trained`` those of the
-        training with its faults, where the two differ.
+        ``flown``: the conditions of ``visthrow compare``. ``trained``: the conditions of the
+        training with its faults, if these differ.
         """
         conditions = {"flown": as_flown(self.experiment)}
         if self.experiment.flown:
@@ -194,8 +194,8 @@ class Trainer:
         }
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint that a resumed run goes on from as if it had not stopped, all
-        processes' in one; all or nothing.
+        """Write a checkpoint with the complete state of all processes, so that a resumed run
+        continues as if it had not stopped. The file is written whole or not at all.
         """
         state = {
             "algorithm": self.algorithm.state_dict(),
@@ -216,10 +216,10 @@ class Trainer:
         atomic_write(path, buffer.getvalue())
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint, each process its own part; one that has none starts new episodes
-        under a new seed.
+        """Restore this process's part of a checkpoint. A process without a part starts new
+        episodes with a new seed.
 
-        Raises CheckpointError: a broken file, or one of another configuration or seed.
+        Raises CheckpointError: the file cannot be read, or its configuration or seed differs.
         """
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
@@ -238,7 +238,7 @@ class Trainer:
         has_state = rank < len(saved["ranks"])
         state = saved["ranks"][rank if has_state else 0]
         self.algorithm.load_state_dict(state["algorithm"], keep_throws=has_state)
-        if not has_state:  # with another's episodes it would collect the same data
+        if not has_state:  # it would collect the same data as the process whose state it has
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return
         torch.set_rng_state(state["rng"].cpu())
@@ -247,14 +247,14 @@ class Trainer:
 
 
 def finish(trainer: Trainer, folder: Path, figures: dict, finished: bool = True) -> Policy:
-    """Write the policy and its figures into the run's folder; a summary only where the run came to
-    its end.
+    """Write the policy and its figures into the run's folder: as a summary if the run finished,
+    otherwise as an evaluation.
     """
     made_by = provenance.collect() | {
         "seed": trainer.seed,
         "config": config.to_dict(
             trainer.experiment, defaults=False
-        ),  # readable when fields come and go
+        ),  # readable after a change of the fields
         "figures": figures,
     }
     policy = trainer.algorithm.export(contract_of(trainer.experiment), made_by)

@@ -1,7 +1,7 @@
-"""Parts of :class:`ThrowEnv`, an option of the task each: delayed poses, moving goals, a fleet.
+"""Optional parts of :class:`ThrowEnv`: delayed poses, moving goals and a fleet of vehicles.
 
-A part holds in ``buffers`` what an episode carries from step to step, and draws in ``begin`` what
-stays fixed over an episode. The order in which parts draw is fixed: a seed gives the same bits."""
+``buffers`` holds a part's state from step to step. ``begin`` draws the quantities that are constant
+over an episode. The parts draw in a fixed order, so that a seed always gives the same bits."""
 
 import math
 
@@ -18,10 +18,10 @@ POSE = ob.VEHICLE + 3
 
 
 class FleetSetup:
-    """The set-up of each environment's vehicle, in the units of its vehicle, shape (E, ...)."""
+    """Properties of each environment's vehicle, in that vehicle's units, shape (E, ...)."""
 
     def __init__(self, fleet: list[Member], task: TaskParams, member: Tensor):
-        """Gather the set-ups; ``member``: index of each environment's vehicle, shape (E,)."""
+        """Gather the properties; ``member``: index of each environment's vehicle, shape (E,)."""
 
         def gather(values: list) -> Tensor:
             return torch.tensor(values, device=member.device, dtype=torch.float32)[member]
@@ -35,28 +35,28 @@ class FleetSetup:
 
 
 class PoseDelay:
-    """A delay line of poses: what is measured is as old as its episode's latency."""
+    """A delay line that makes measured poses as old as the latency of their episode."""
 
     def __init__(self, params: ObservationParams, period: float, like: Tensor, unit: Tensor | None):
-        """Allocate.
+        """Allocate the delay line.
 
         Args:
-            params: latency and its jitter. period: of control [s].
-            like: shape (E, ...), gives count and device.
-            unit: of each environment's time [s], shape (E,), in which latencies are stated; None
-                for seconds.
+            params: latency and its jitter. period: control period [s].
+            like: tensor of shape (E, ...) that determines the count and the device.
+            unit: unit of time in which each environment's latencies are stated [s], shape (E,);
+                None for seconds.
         """
         self._params = params
         self._period = period
         self._unit = torch.ones_like(like[:1]) if unit is None else unit
         oldest = params.oldest / float(self._unit.min())
         steps = 1 + max(math.ceil(oldest / period - 1e-6), 1)
-        self.age = like.new_zeros(len(like))  # of what is measured in these episodes [s]
+        self.age = like.new_zeros(len(like))  # age of measured poses in each episode [s]
         self.poses = like.new_zeros(len(like), steps, POSE)
         self.buffers = {"pose_age": self.age, "poses": self.poses}
 
     def begin(self, fresh: Tensor) -> None:
-        """Draw the latency of the episodes that begin."""
+        """Draw latencies for the episodes that begin; ``fresh``: bool, shape (E,)."""
         low, high = self._params.latency
         if high == 0.0:
             return
@@ -64,7 +64,9 @@ class PoseDelay:
         torch.where(fresh, sample / self._unit, self.age, out=self.age)
 
     def push(self, pose: Tensor, fresh: Tensor) -> Tensor:
-        """Take the current pose sample; return the delayed one, linear between control steps."""
+        """Store the current pose sample and return the delayed one, interpolated linearly between
+        control steps.
+        """
         poses = self.poses
         poses.copy_(arrays.push(poses, pose, fresh))
         if self._params.oldest == 0.0:
@@ -82,7 +84,7 @@ class PoseDelay:
         return newer + (older - newer) * (age - whole)[:, None]
 
     def exact(self, age: float) -> Tensor:
-        """Pose sample of so long ago [s], at most a control period, shape (E, POSE)."""
+        """Return the pose sample of an age [s] of at most a control period, shape (E, POSE)."""
         return torch.lerp(self.poses[:, 0], self.poses[:, 1], age / self._period)
 
 
@@ -90,13 +92,13 @@ class MovingGoals:
     """Goals that move at a constant velocity, drawn for each episode."""
 
     def __init__(self, speed: tuple[float, float], like: Tensor):
-        """Allocate; ``speed``: slowest and fastest [m/s]. like: shape (E, ...)."""
+        """Allocate; ``speed``: lowest and highest [m/s]; ``like``: tensor of shape (E, ...)."""
         self._slowest, self._fastest = speed
         self.velocity = like.new_zeros(len(like), 3)  # [m/s], world frame
         self.buffers = {"goal_vel": self.velocity}
 
     def begin(self, fresh: Tensor) -> None:
-        """Draw speed and heading of the episodes that begin."""
+        """Draw goal velocities for the episodes that begin; ``fresh``: bool, shape (E,)."""
         sample = torch.rand_like(self.velocity[:, :2])
         speed = self._slowest + (self._fastest - self._slowest) * sample[:, 0]
         heading = 2.0 * math.pi * sample[:, 1]

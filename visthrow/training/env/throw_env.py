@@ -1,8 +1,8 @@
 """ThrowEnv: the throwing task as rsl_rl's vectorised environment.
 
-A step is a chain of device operations without branches on data, allocations on the simulator's side
-or copies to the host, so a whole rollout can be captured in one CUDA graph
-(:mod:`visthrow.training.ppo.ppo_training`). Every observation is a fresh tensor."""
+A step is a sequence of device operations. It does not branch on data, the simulator allocates
+nothing, and nothing is copied to the host, so a whole rollout can be captured in one CUDA graph
+(:mod:`visthrow.training.ppo.ppo_training`). Every observation is a new tensor."""
 
 import torch
 import warp as wp
@@ -25,32 +25,34 @@ from visthrow.training.env.throw_episodes import ThrowEpisodes
 
 
 class ThrowEnv(ThrowEpisodes):
-    """Batch of throws. Observation groups: ``actor`` and ``critic``.
+    """A batch of throws with the observation groups ``actor`` and ``critic``.
 
-    The critic sees what ``ppo.privileged`` names. ``exact``: vehicle, goal offset and payload
-    history without noise, else the actor's observation. ``payload_velocity`` [m/s].
-    ``release_timer``: to separation [s]. ``time``: since the start [s]. ``mass``: the vehicle's
-    scale. ``voltage``: of the battery [V]. ``goal_velocity`` [m/s] and ``cargo``, the scales of
-    payload mass and cable length, where the task has them. ``mount``: the camera's rotation [rad]
-    and offset [m] from its nominal pose. ``pose_age``: of what is measured [s]. ``vehicle``: of a
-    fleet, all of its set-up. The paper's critic, as we read it, receives the first two, 38 numbers.
+    The critic observes the quantities in ``ppo.privileged``. ``exact``: vehicle, goal offset and
+    payload history without noise, instead of the actor's observation. ``payload_velocity`` [m/s].
+    ``release_timer``: time to separation [s]. ``time``: time since the start [s]. ``mass``: scale
+    of the vehicle's mass. ``voltage``: battery voltage [V]. ``goal_velocity`` [m/s], if goals move.
+    ``cargo``: scales of payload mass and cable length, if these vary. ``mount``: the camera's
+    rotation [rad] and offset [m] from its nominal pose. ``pose_age``: age of measured poses [s].
+    ``vehicle``: all properties of the vehicle, in a fleet. We understand that the paper's critic
+    receives the first two, 38 numbers.
 
     Attributes:
-        last: what the last step ended: ``released``, ``negative`` (bool), ``landing_error`` [m],
+        last: results of the last step: ``released``, ``negative`` (bool), ``landing_error`` [m],
             ``duration`` [s] from the policy's start to the payload's landing, ``landing_w`` [m],
-            ``clearance`` [m]; each over (E,). Where goals move, ``goal_w`` [m] too, where the goal
-            is at impact.
+            ``clearance`` [m]; each over (E,). If goals move, also ``goal_w`` [m], the goal's
+            position at impact.
     """
 
     def __init__(
         self, experiment: Experiment, device: str = "cpu", seed: int = 0, count: int | None = None
     ):
-        """Build simulator and buffers and start all episodes.
+        """Build the simulator and the buffers and start all episodes.
 
         Args:
-            experiment, device: plant, camera, task; "cpu" or "cuda:0".
-            seed: of the simulator's resets; torch's own generator draws the noise and is the
-                caller's to seed.
+            experiment: plant, camera and task.
+            device: "cpu" or "cuda:0".
+            seed: seed of the simulator's resets. The noise comes from torch's generator, which the
+                caller seeds.
             count: number of environments; default the experiment's.
         """
         self.cfg = experiment
@@ -80,7 +82,7 @@ class ThrowEnv(ThrowEpisodes):
         self.reset()
 
     def _build(self, fleet: list[Member], seed: int) -> tuple[list[RopeParams], int]:
-        """Build the simulator; return its ropes, and how many of them each plant has."""
+        """Build the simulator; return its ropes and the number of ropes for each plant."""
         experiment = self.cfg
         plants = [member.plant for member in fleet] or draw_plants(experiment, seed)
         start = experiment.task.start
@@ -113,47 +115,47 @@ class ThrowEnv(ThrowEpisodes):
             self.buffers["goal_fit"] = goal_motion.empty_sums(E, self.device)
 
     def exact_frame(self, age: float) -> Tensor:
-        """State frame without noise, shape (E, 20), as it was so long ago [s], at most a control
+        """Return the state frame without noise, shape (E, 20), of an age [s] of at most a control
         period.
         """
         return self._state_frame(self.delay.exact(age), self.views.goal_w)
 
     def begin_throws(self, correction: tuple[Tensor, Tensor]) -> TensorDict:
-        """Begin throws where the vehicles are, with the ``correction`` that a calibration in hover
-        estimated.
+        """Begin throws from the vehicles' present states, with the ``correction`` that a
+        calibration in hover estimated.
 
-        Keypoints are corrected from now on for the cameras' turns [rad], shape (E, 3), and errors
-        of focal length [-], shape (E,)."""
+        From now on keypoints are corrected for the cameras' rotations [rad], shape (E, 3), and for
+        relative errors of the focal length, shape (E,)."""
         self.view.correction = correction
         self.episode_length_buf.zero_()
         self.previous_action.copy_(self.start_action.expand_as(self.previous_action))
         return self._look(self._everywhere)
 
     def reset(self) -> TensorDict:
-        """Start a new episode everywhere."""
+        """Start a new episode in every environment."""
         self._begin(self._everywhere)
         return self._look(self._everywhere)
 
     def _look(self, fresh: Tensor) -> TensorDict:
-        """Observe, and keep what is observed."""
+        """Observe and store the observations."""
         self._observations = self._observe(fresh)
         return self._observations
 
     def carry(self, actions: Tensor, mask: wp.array | None = None) -> TensorDict:
-        """Apply unclipped actions, shape (E, 5), for one control period with the latch shut,
-        whatever becomes of it: no episode ends.
+        """Apply unclipped actions, shape (E, 5), for one control period with the latch held shut.
+        No episode ends, even in a failure.
 
-        ``mask``: plants that move on, shape (E,), int32; default all.
+        ``mask``: the plants that are stepped, shape (E,), int32; default all.
         """
         self.previous_action.copy_(self._apply(actions, True, mask))
         return self._look(~self._everywhere)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start
-        anew.
+        """Apply unclipped actions, shape (E, 5), for one control period and restart finished
+        episodes.
 
-        Returns observations, rewards (E,), dones (E,), and an empty dictionary: the time limit is a
-        negative end and must not be bootstrapped, so there are no ``time_outs``."""
+        Returns observations, rewards (E,), dones (E,), and an empty dictionary. The time limit is a
+        failure and must not be bootstrapped, so there are no ``time_outs``."""
         action = self._apply(actions)
         reward, done = self._judge(action)
         self._count(done)
@@ -162,7 +164,7 @@ class ThrowEnv(ThrowEpisodes):
         return self._look(done), reward, done.float(), {}
 
     def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
-        """Fly one control period; returns the clipped actions."""
+        """Fly one control period and return the clipped actions."""
         action = self._command(actions)
         asked = act.wants_release(actions, self.cfg.release.threshold)
         self.views.release.copy_(asked & (not hold))
@@ -174,7 +176,7 @@ class ThrowEnv(ThrowEpisodes):
         return action
 
     def find_failures(self) -> Tensor:
-        """Whether a negative end has come, bool, shape (E,)."""
+        """Return whether each flight has failed, bool, shape (E,)."""
         state = self.views.state
         return terminations.negative(
             self.cfg.task.bounds,
@@ -188,7 +190,7 @@ class ThrowEnv(ThrowEpisodes):
         )
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Reward and end of the step just made."""
+        """Return the rewards of the last step, shape (E,), and whether it ended its episode."""
         out = self.views.out
         period = self.cfg.sim.control_period
         p = self.cfg.task.reward
@@ -219,14 +221,15 @@ class ThrowEnv(ThrowEpisodes):
         return p.scale * reward, released | negative
 
     def _goal_in(self, time: Tensor) -> Tensor:
-        """Goal [m], shape (E, 3), where it is in a time [s], shape (E,)."""
+        """Return the goals' positions [m], shape (E, 3), after a time [s], shape (E,)."""
         if self.goals is None:
             return self.views.goal_w
         return self.views.goal_w + self.goals.velocity * time[:, None]
 
     def _begin(self, fresh: Tensor) -> None:
-        """Start episodes where ``fresh``, bool, shape (E,), and draw what stays fixed in them."""
-        self._fresh = fresh.to(torch.int32)  # until the launches have read it
+        """Start episodes where ``fresh``, bool, shape (E,), and draw their constant quantities."""
+        # an attribute, so that it lives until the launches have read it
+        self._fresh = fresh.to(torch.int32)
         with on_torch_stream(self.device):
             self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
         if self._goal is not None:
@@ -243,7 +246,7 @@ class ThrowEnv(ThrowEpisodes):
 
     @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
-        """Actor's and critic's view of the current state."""
+        """Return the actor's and the critic's observations of the current state."""
         state = self.views.state
         buffers = self.buffers
         layout = self.layout
@@ -299,7 +302,7 @@ class ThrowEnv(ThrowEpisodes):
     def _critic_view(
         self, actor: Tensor, vehicle: Tensor, payload: Tensor, time: Tensor, fresh: Tensor
     ) -> Tensor:
-        """Critic's view: what ``ppo.privileged`` names."""
+        """Return the critic's observation, the quantities in ``ppo.privileged``."""
         state = self.views.state
         buffers = self.buffers
         named = self.cfg.ppo.privileged
@@ -334,7 +337,7 @@ class ThrowEnv(ThrowEpisodes):
         return torch.cat(parts, dim=-1)
 
     def _tensors(self) -> dict[str, Tensor]:
-        """All that the next step depends on, besides torch's generators."""
+        """Return all state that the next step depends on, except torch's generators."""
         memory = self.buffers.copy()
         for part in self._parts():
             memory |= part.buffers
@@ -354,13 +357,13 @@ class ThrowEnv(ThrowEpisodes):
         return tensors
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Copy of all that the next step depends on, besides torch's generators."""
+        """Return a copy of all state that the next step depends on, except torch's generators."""
         return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
-        """Take up a state of :meth:`state_dict`.
+        """Restore a state of :meth:`state_dict`.
 
-        Raises ValueError: the state is of an environment of another experiment or size.
+        Raises ValueError: the state comes from an environment of another experiment or size.
         """
         for name, target in self._tensors().items():
             if name not in saved or saved[name].shape != target.shape:

@@ -1,4 +1,4 @@
-"""ThrowEpisodes: what the environments of one vehicle and of a team have in common."""
+"""ThrowEpisodes: the common base of the environments of one vehicle and of a team."""
 
 from typing import ClassVar
 
@@ -16,9 +16,10 @@ from visthrow.task import Experiment, plant_of, rewards
 
 
 class ThrowEpisodes(VecEnv):
-    """Episodes of rows of vehicles: commands with their noise, the reward of carrying, sums.
+    """Episodes of a batch of vehicles: commands with noise, rewards while carrying, and statistics
+    of finished episodes.
 
-    A task sets ``cfg``, ``views`` and ``layout``.
+    A subclass sets ``cfg``, ``views`` and ``layout``.
     """
 
     cfg: Experiment
@@ -29,12 +30,11 @@ class ThrowEpisodes(VecEnv):
         "landing_error": "released",
         "duration": "released",
     }
-    """Sums over finished episodes, errors in [m] and durations in [s], and what their means are
-    over."""
+    """Sum over finished episodes (errors [m], durations [s]) -> count for its mean."""
 
     def _allocate(self, like: Tensor) -> None:
-        """Allocate weights, limits and the buffers that an episode carries besides the simulator's
-        state; ``like``: of a number for each row.
+        """Allocate weights, limits and the buffers of an episode that are not in the simulator;
+        ``like``: a tensor with one number for each vehicle.
         """
         task = self.cfg.task
         rows = len(like)
@@ -58,7 +58,7 @@ class ThrowEpisodes(VecEnv):
 
     @property
     def previous_action(self) -> Tensor:
-        """Clipped action of the last step, shape (E, 5)."""
+        """Return the clipped action of the last step, shape (E, 5)."""
         return self.buffers["previous"]
 
     def fix_goal(self, goal_w: Tensor) -> None:
@@ -66,22 +66,22 @@ class ThrowEpisodes(VecEnv):
         self._goal = goal_w
 
     def clear_totals(self) -> None:
-        """Start the sums again."""
+        """Reset the sums over finished episodes to zero."""
         self.buffers["totals"].zero_()
 
     def episode_means(self) -> dict[str, float]:
-        """Means over the episodes that finished since :meth:`clear_totals`, and their number."""
+        """Return means over the episodes finished since :meth:`clear_totals`, and their number."""
         names = ("episodes", *self.results)
         totals = dict(zip(names, self.buffers["totals"].tolist(), strict=True))
         means = {name: totals[name] / max(totals[of], 1.0) for name, of in self.results.items()}
         return means | {"episodes": totals["episodes"]}
 
     def get_observations(self) -> TensorDict:
-        """Observations of the current step."""
+        """Return a copy of the current observations."""
         return self._observations.clone()
 
     def _command(self, actions: Tensor) -> Tensor:
-        """Set the commands of unclipped actions, with noise; returns the clipped actions."""
+        """Set the commands from unclipped actions, with noise; return the clipped actions."""
         action = act.clip_action(actions)
         bias = self.buffers["command_bias"]
         noise = torch.randn_like(bias) * self.cfg.task.noise.command_step
@@ -91,13 +91,15 @@ class ThrowEpisodes(VecEnv):
         return action
 
     def _count(self, done: Tensor, *more: Tensor) -> None:
-        """Add the episodes that ended in the last step to the sums; ``more``: of further ones."""
+        """Add the episodes that ended in the last step to the sums; ``more``: terms of the sums
+        that a subclass has in addition.
+        """
         hit = self.last["released"].float()
         parts = [done.float(), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
         self.buffers["totals"] += torch.stack([*parts, *more]).sum(-1, dtype=torch.float64)
 
     def _carry_reward(self, action: Tensor, payload_vel_w: Tensor) -> Tensor:
-        """Reward of a step with the payload on the cable."""
+        """Return the reward of a step with the payload attached, shape (E,)."""
         p = self.cfg.task.reward
         state = self.views.state
         reward = rewards.kinetic(p, state["vel_w"], state["rate_b"], payload_vel_w)
@@ -105,7 +107,7 @@ class ThrowEpisodes(VecEnv):
         return reward + rewards.change(p, action, self.previous_action, self.change_weights)
 
     def _restart(self, fresh: Tensor) -> None:
-        """Begin the rows where ``fresh``, bool, shape (E,), and draw their biases."""
+        """Restart the episodes where ``fresh``, bool, shape (E,), and draw their biases."""
         noise = self.cfg.task.noise
         self.episode_length_buf.masked_fill_(fresh, 0)
         previous = self.previous_action
@@ -114,11 +116,11 @@ class ThrowEpisodes(VecEnv):
         arrays.redraw(self.buffers, spreads, fresh)
 
     def _state_frame(self, pose: Tensor, goal_w: Tensor) -> Tensor:
-        """State frame of a pose sample and a goal, shape (E, 20)."""
+        """Return the state frame of a pose sample and a goal, shape (E, 20)."""
         offset = ob.state_part(pose[:, :3], goal_w, pose[:, ob.VEHICLE :])
         return torch.cat([pose[:, : ob.VEHICLE], offset], dim=-1)
 
     def _measure(self, frame: Tensor) -> Tensor:
-        """Add the noise of a step and the episode's biases to a state frame."""
+        """Return a state frame with the noise of a step and the episode's biases added."""
         noise = torch.randn_like(frame) * self.cfg.task.noise.observation_step
         return frame + noise + self.buffers["frame_bias"]

@@ -1,9 +1,9 @@
-"""Backward pass of flights: through the surrogate a kernel a step, a thread a flight, and between
-two of them through the network.
+"""Backward pass of flights: one kernel for each step of the surrogate, with a thread for each
+flight, and the network's derivatives between steps.
 
-Warp differentiates the surrogate's step. What a derivative by a state is worth is known once all
-later steps are done: so the network is differentiated by its observations step by step, and by its
-weights over all steps at the end."""
+Warp differentiates the surrogate's step. The derivative of the cost by a state is complete when all
+later steps have been propagated. Therefore the network is differentiated by its observations step
+by step, and by its weights for all steps together at the end."""
 
 import torch
 import warp as wp
@@ -15,10 +15,10 @@ from visthrow.onboard import observations as ob
 from visthrow.training.first_order.surrogate import TAUT, Course
 from visthrow.training.ppo.network import Network
 
-# least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away
-# from there
+# lowest throttle at which the thrust's slope is evaluated: at throttle 0 the slope is 0, and no
+# gradient would lead away from it
 SLACK_THROTTLE = 0.05
-# columns of a state observation where previous action, goal and payload begin
+# first columns of previous action, goal and payload in a state observation
 PREVIOUS_AT = ob.VEHICLE
 GOAL_AT = ob.VEHICLE + 5
 LOAD_AT = ob.VEHICLE + 7
@@ -26,7 +26,7 @@ LOAD_AT = ob.VEHICLE + 7
 
 @wp.struct
 class BackwardParams:
-    """The dimensions of flights and policy."""
+    """Parameters of surrogate, plants and policy."""
 
     response: wp.array(dtype=wp.vec4)
     force: wp.array(dtype=float)
@@ -43,7 +43,9 @@ class BackwardParams:
 
 
 def _make_attach(kind: type) -> wp.Function:
-    """Return the function that gives a value the derivatives of another."""
+    """Return a function whose value is its first argument and whose derivative is that of its
+    second.
+    """
 
     @wp.func
     def at(value: kind, slope: kind):
@@ -61,7 +63,7 @@ number_at, vector_at, response_at, turn_at = map(_make_attach, (float, wp.vec3, 
 
 @wp.func
 def command(p: BackwardParams, action: wp.array3d(dtype=float), k: int, e: int):
-    """Return thrust and rates that an action commands, as its derivatives have it."""
+    """Return the commanded thrust and rates of an action, with the slope for the derivatives."""
     throttle = 0.5 * (wp.clamp(action[k, e, 0], -1.0, 1.0) + 1.0)
     slack = SLACK_THROTTLE * (2.0 * throttle - SLACK_THROTTLE)
     return wp.vec4(
@@ -74,7 +76,7 @@ def command(p: BackwardParams, action: wp.array3d(dtype=float), k: int, e: int):
 
 @wp.func
 def arm_of(p: BackwardParams, x: Course, k: int, e: int):
-    """Return the rope's vector in state k."""
+    """Return the vector from the rope's mount to the payload in state k [m], world frame."""
     return x.load_pos[k, e] - x.pos[k, e] - wp.quat_rotate(x.quat[k, e], p.mount[e])
 
 
@@ -82,7 +84,7 @@ def arm_of(p: BackwardParams, x: Course, k: int, e: int):
 def advance(
     p: BackwardParams, x: Course, made: Course, action: wp.array3d(dtype=float), k: int, e: int
 ):
-    """Make state k + 1 of state k and the commands up to k."""
+    """Compute state k + 1 from state k and the commands up to k."""
     dt = p.period
     decay = p.decay
     after = k + 1
@@ -133,8 +135,8 @@ def advance(
 def show(
     p: BackwardParams, x: Course, observation: wp.array2d(dtype=float), k: int, e: int, share: float
 ):
-    """Add the share of an observation that state k has, with the payload as it was up to
-    ``history`` steps before.
+    """Add a share of the observation of state k, with the payload's positions of up to ``history``
+    earlier steps.
     """
     rot = x.quat[k, e]
     forward = wp.quat_rotate(rot, wp.vec3(1.0, 0.0, 0.0))
@@ -165,7 +167,7 @@ def step(
     steps: wp.array(dtype=wp.int32),
     action: wp.array3d(dtype=float),
     # Out:
-    made: Course,  # of no use but for the derivatives, which it shares with x
+    made: Course,  # only its gradients matter; they are those of x
     observation: wp.array2d(dtype=float),  # observation k + 1
 ):
     e = wp.tid()
@@ -179,12 +181,12 @@ def step(
 
 
 class Layers:
-    """A network's actions over the steps of flights, shape (T, E, 5), with derivatives by them and
-    by what one step saw, shape (E, D).
+    """A network's actions over the steps of flights, shape (T, E, 5), with the derivatives by them
+    and by the observations of one step, shape (E, D).
     """
 
     def __init__(self, network: Network, obs: Tensor):
-        """Allocate; ``obs``: where flights write what they see, shape (T, E, D)."""
+        """Allocate; ``obs``: buffer of the flights' observations, shape (T, E, D)."""
         self._network = network
         self._obs = obs
         self.action, self.by_action = obs.new_zeros(2, *obs.shape[:2], actions.ACTIONS)
@@ -194,16 +196,16 @@ class Layers:
         return self._network.mlp(self._network.obs_normalizer(obs))
 
     def forward(self, k: int, obs: Tensor, flying: Tensor) -> Tensor:
-        """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are
-        flying, shape (E,).
+        """Return the actions of step k, shape (E, 5), for observations, shape (E, D), of the
+        flights in progress, shape (E,).
         """
         rows = _select_rows(flying)
         self.action[k, rows] = self._decide(obs[rows])
         return self.action[k]
 
     def backpropagate(self, k: int, flown: Tensor) -> None:
-        """Turn derivatives by the actions of step k into those by its observations, of the flights
-        that flew it, shape (E,).
+        """Convert derivatives by the actions of step k to derivatives by its observations, for the
+        flights that flew this step, shape (E,).
         """
         rows = _select_rows(flown)
         with torch.enable_grad():
@@ -214,8 +216,8 @@ class Layers:
         )
 
     def gradients(self, flown: Tensor, shares: Tensor) -> None:
-        """Give the weights their derivatives from the steps that were flown, bool, shape (T, E);
-        flights count by shares, shape (E,).
+        """Set the gradients of the weights from the steps that were flown, bool, shape (T, E), with
+        a factor for each flight, shape (E,).
         """
         rows = _select_rows(flown.flatten())
         obs, by_action = (
@@ -230,7 +232,7 @@ class Layers:
 
 
 def _select_rows(mask: Tensor) -> Tensor | slice:
-    """Rows where a mask, shape (N,), is not 0; all of them where that is so, and on a GPU, which
-    would have to wait to know.
+    """Return the rows where a mask, shape (N,), is not 0. On a GPU return all rows, because a
+    selection would have to wait for the device.
     """
     return slice(0, len(mask)) if mask.is_cuda or bool(mask.all()) else mask.nonzero()[:, 0]

@@ -1,5 +1,5 @@
-"""First-order training: the cost of flights, in which a hazard weighs a release at every step, and
-its descent.
+"""First-order training: the cost of flights, in which a hazard weights a release at every step, and
+gradient descent on it.
 """
 
 import dataclasses
@@ -25,34 +25,34 @@ from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.network import MuonAdam, Network, average_weights, cosine_rate
 from visthrow.training.ranks import Ranks
 
-# Reach of the barriers
-ALTITUDE = 0.15  # of altitude and distance [m]
-GROUND = 0.1  # of the payload over the ground [m]
-ABOVE = 0.08  # of the vehicle above the payload [m]
+# Widths of the barriers
+ALTITUDE = 0.15  # before the bounds of altitude and distance [m]
+GROUND = 0.1  # of the payload's height over the ground [m]
+ABOVE = 0.08  # of the vehicle's height above the payload [m]
 UPRIGHT = 0.15  # of the cosine of the tilt
-PULL = 0.4  # least pull of the rope that costs nothing, in weights of the payload
-SLACK = 0.3  # a missing pull of one weight costs as much as a state this far within a barrier [m]
-BARRIER = 600.0  # cost of the square of how far a state is within it
+PULL = 0.4  # lowest tension of the rope without a cost, in weights of the payload
+SLACK = 0.3  # depth in a barrier that costs as much as a missing tension of one weight [m]
+BARRIER = 600.0  # cost of the squared depth in a barrier
 ROUND = 0.02
-"""Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
-is noise where throws are good.
+"""Length below which landing errors are smoothed [m]: the gradient of a distance reverses at the
+goal, which is noise for accurate throws.
 """
-OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
-NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
+OUTLIER = 4.0  # limit of a flight's derivatives, in multiples of the median flight's
+NODES = (-1, 0, 1, 2)  # steps around a separation, the nodes of a cubic interpolation
 REACH = 2
-"""Most steps by which a release comes early or late.
+"""Largest number of steps by which a release is shifted.
 
-Half of all releases come a step early, then half of all a step late, and both once more. The cost
-of a release is the mean over these, so a policy learns to release where the landing hardly moves
-with time. Without them it moved by 0.02 to 0.1 m a step in some trainings, and noise shifts a
-release by a step.
+Half of all releases are shifted to a step earlier, then half of all to a step later, and both a
+second time. The cost of a release is the mean over these, so that a policy learns to release when
+the landing point hardly changes with time. Without the shifts it changed by 0.02 to 0.1 m a step in
+some trainings, and noise shifts a release by a step.
 """
 
-AVERAGED = 10  # gradients that the exported weights are a mean of, at most
+AVERAGED = 10  # longest window of gradient steps over which the exported weights are averaged
 
 
 def _require_supported(experiment: Experiment) -> None:
-    """Raise ConfigError for a task that flights without release cannot be trained on."""
+    """Raise ConfigError for a task that first-order training does not support."""
     observation = experiment.task.observation
     late = observation.oldest > experiment.sim.control_period
     unsupported = experiment.task.target.moves or experiment.fleet is not None
@@ -65,7 +65,7 @@ def _require_supported(experiment: Experiment) -> None:
 
 
 class FirstOrder(Algorithm):
-    """First-order training by a surrogate that is fitted to the environment's plants."""
+    """First-order training with a surrogate that is fitted to the environment's plants."""
 
     parts = ("network", "average", "optimizer")
 
@@ -103,7 +103,7 @@ class FirstOrder(Algorithm):
         self.flights = FlightBatch(env, horizon)
         with torch.no_grad():
             self.surrogate = fit(self.flights)
-            # random commands give every observation a spread to start from
+            # initial statistics of the observations, from flights with random commands
             self.network.update_normalization(
                 {"actor": self.flights.obs[self.flights.mark_flown_steps()]}
             )
@@ -129,8 +129,8 @@ class FirstOrder(Algorithm):
         )
 
     def _schedule(self, done: float) -> None:
-        """Width of the hazard, share of the latch in it, and first step that it counts at, at this
-        share of the training.
+        """Set the hazard's width, the latch's share in its value, and its first step after a share
+        ``done`` of the training.
         """
         p = self.p
         self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
@@ -145,14 +145,15 @@ class FirstOrder(Algorithm):
         self.flights.fly(self._decide)
 
     def _decide(self, k: int, obs: Tensor) -> Tensor | None:
-        """Return the policy's actions, on a CPU of each flight until nothing that follows has a
-        derivative: its latch asked twice.
-        """
+        """Return the policy's actions at step k, or None when all flights have ended.
+
+        On a CPU a flight ends when later steps have no derivative: after its second request to
+        release."""
         flying = self.flights.flying
         if k == 0:
             self._requests.zero_()
         stops = self._latched == 1.0 and self.env.device == "cpu"
-        # all that the cost of a release there depends on is known
+        # the last step whose cost of a release is fully determined
         before = k - (self.lag + NODES[-1] + 1 + REACH)
         if stops and before >= self._first:
             asked = self.layers.action[before, :, act.COMMANDS] > self.experiment.release.threshold
@@ -163,8 +164,8 @@ class FirstOrder(Algorithm):
         return None
 
     def _rewards_at_release(self, x: SimpleNamespace, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward, landing error [m] and time to impact [s] of a release at each of the first steps,
-        shape (count, E).
+        """Return reward, landing error [m] and time to impact [s] of a release at each of the first
+        ``count`` steps, shape (count, E).
         """
         p = self.experiment.task.reward
         release = self.experiment.release
@@ -172,7 +173,7 @@ class FirstOrder(Algorithm):
         up = x.load_vel[..., 2]
         fall = fall_time(x.load_pos[..., 2] - release.landing_height, up, floor=1e-6)
         landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
-        # the simulator's values, the slopes of flight without drag
+        # values of the simulator, with the slopes of a flight without drag
         landing = landing + (flights.landing[: len(fall)] - landing).detach()
         fall = fall + (flights.time[: len(fall)] - fall).detach()
         shares = torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
@@ -191,16 +192,16 @@ class FirstOrder(Algorithm):
         return reward, error, fall
 
     def _pull(self, x: SimpleNamespace) -> Tensor:
-        """Return the rope's pull in weights of the payload, for each step, shape (T, E).
+        """Return the rope's tension at each step, in weights of the payload, shape (T, E).
 
-        While the rope is slack the vehicle does not move the payload, and the surrogate does not
-        model the jerk that follows."""
+        On a slack rope the vehicle does not move the payload, and the surrogate does not model the
+        jerk that follows."""
         rope = torch.nn.functional.normalize(x.load_pos[1:] - x.pos[1:], dim=-1)
         gain = (x.load_vel[1:] - x.load_vel[:-1]) / self.experiment.sim.control_period
         return -(rope * gain).sum(-1) / GRAVITY - rope[..., 2]
 
     def _reward_carrying(self, x: SimpleNamespace) -> Tensor:
-        """Rewards of each step while carrying, barriers included, shape (T, E)."""
+        """Return the rewards of each step while carrying, with the barriers, shape (T, E)."""
         task = self.experiment.task
         env = self.env
         p = task.reward
@@ -229,23 +230,24 @@ class FirstOrder(Algorithm):
         return moving + commanding + changing + time - barrier
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean cost of the flights and figures of what is released."""
+        """Return the mean cost of the flights, and figures of their releases."""
         p = self.experiment.task.reward
         steps = self.flights.steps
         T = self.flights.last
         lag = self.lag
         k = torch.arange(T, device=steps.device)[:, None]
-        K = T - lag - 1  # the cubic looks a step past the separation
+        K = T - lag - 1  # the cubic needs a step after the separation
         released = k[:K]
         reward, error, fall = self._rewards_at_release(x, K)
         latch_input = x.action[:K, :, act.COMMANDS] - self.experiment.release.threshold
         smooth = torch.sigmoid(latch_input / self._width)
         cut = released + lag + 2 > steps
-        # the slope stays that of the smooth one
+        # the slope remains that of the smooth hazard
         hazard = smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
         hazard = torch.where(released > steps, 1.0, hazard * (released >= self._first))
         reward = torch.where(cut, -p.termination, reward)
-        for shift in (1, -1) * REACH:  # first and last steps meet, where nothing is released
+        # roll wraps around, but there is no release in the first and last steps
+        for shift in (1, -1) * REACH:
             reward = 0.5 * (reward + reward.roll(shift, 0))
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
@@ -286,7 +288,7 @@ class FirstOrder(Algorithm):
         return figures | {"cost": cost}
 
     def _record_launches(self) -> list[wp.Launch]:
-        """Return the launches of the surrogate's way back, a step each."""
+        """Return the launches of the surrogate's backward pass, one for each step."""
         env = self.env
         flights = self.flights
         layers = self.layers
@@ -328,7 +330,7 @@ class FirstOrder(Algorithm):
 
     @torch.no_grad()
     def _run_backward(self) -> None:
-        """Turn derivatives of the cost by states and actions into whole derivatives by the
+        """Convert partial derivatives of the cost by states and actions to total derivatives by the
         actions.
         """
         for k in reversed(range(self.flights.last)):
@@ -348,7 +350,7 @@ class FirstOrder(Algorithm):
         rate = cosine_rate(self.optimizer, done, p.learning_rate, p.final_rate)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
-        # a few wild flights must not outweigh the rest
+        # a few extreme flights must not dominate the gradient
         limit = OUTLIER * size.median()
         self.layers.gradients(self.flights.mark_flown_steps()[:T], (limit / size).clamp(max=1.0))
         self._ranks.average(parameters)
@@ -364,14 +366,12 @@ class FirstOrder(Algorithm):
         }
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers."""
+        """Start from a policy with the same layers."""
         super().take_up(policy)
         self._adapt()
 
     def _adapt(self) -> None:
-        """Take the schedules of a training that starts from a policy: it releases as it has learnt
-        to.
-        """
+        """Use the schedules of a training that starts from a policy, which already releases."""
         p = self.p
         self._adapting = True
         self.iterations = p.adapting

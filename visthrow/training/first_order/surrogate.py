@@ -1,9 +1,9 @@
-"""Surrogate of one control step, which first-order training differentiates in the simulator's
-place.
+"""Surrogate of one control step, which first-order training differentiates instead of the
+simulator.
 
-The simulator flies; every value below is the simulator's own, and the surrogate lends its
-derivative at that point. With the response ``y = (thrust, body rates)``, commands u, vehicle p, v,
-R, payload q, s and the control period dt:
+The values of all states come from the simulator; the surrogate supplies the derivatives at these
+states. With the response ``y = (thrust, body rates)``, commands u, vehicle p, v, R, payload q, s
+and the control period dt:
 
     y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c
     R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2)
@@ -11,11 +11,11 @@ R, payload q, s and the control period dt:
     T      = mu (-a n.f / M + b |u_perp|^2 / l)
     v[k+1] = v + dt (f / M + g + T n / M),  s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
 
-The first line holds for each channel: controller, motors and queue. F and z are mean thrust and
-mean body z of the step, u = s - v, n and l are those of the rope as a taut, massless rod,
-and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the
-simulator under random commands by linear least squares;
-:mod:`visthrow.training.first_order.backward` has the derivatives."""
+The first line describes controller, motors and queue and holds for each channel. F and z are mean
+thrust and mean body z axis of the step, u = s - v, and n and l are direction and length of the rope
+as a taut, massless rod. Positions follow by the trapezoidal rule. A0, A1, B, c, kappa, drag, a and
+b are fitted by linear least squares to simulated flights under random commands.
+:mod:`visthrow.training.first_order.backward` computes the derivatives."""
 
 from collections.abc import Callable
 
@@ -30,19 +30,19 @@ from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
 from visthrow.training.env import ThrowEnv
 
-# spread of random actions about hover; three times as much saturates the motors of a heavy vehicle,
-# and the fitted thrust follows its command by a fifth
+# standard deviation of random actions about hover; three times these values saturate the motors of
+# a heavy vehicle, and the fitted thrust then responds to its command by only a fifth
 EXCITED = (0.1, 0.15, 0.15, 0.15, 0.0)
-RETAINED = 0.7  # share of a random action that the next keeps
-FITTED = 8000  # steps of flight that the fit rests on
-TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
+RETAINED = 0.7  # correlation of successive random actions
+FITTED = 8000  # steps of flight for the fit
+TAUT = 0.1  # tension above which the rope counts as taut, in weights of the payload
 
 STATES = ("pos", "vel", "quat", "load_pos", "load_vel", "response")
 
 
 @wp.struct
 class Course:
-    """Course of flights, (T + 1, E), with derivatives of a cost by it as gradients."""
+    """States of flights, (T + 1, E), with the derivatives of a cost by them as gradients."""
 
     pos: wp.array2d(dtype=wp.vec3)
     vel: wp.array2d(dtype=wp.vec3)
@@ -53,18 +53,19 @@ class Course:
 
 
 class FlightBatch:
-    """A batch of flights without release and the plants that make them.
+    """A batch of flights without release, and their plants.
 
     Attributes:
         x: states by :data:`STATES` and commands, shape (T + 1, E, 3 or 4). adjoint: derivatives by
-            the states. course: both for kernels; made: the derivatives with room for states.
-        obs: what the actor observes, shape (T, E, D).
-        landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s],
-            shape (T + 1, E).
-        mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of
-            the ropes [m], shape (E, 3).
-        flying: whether a flight goes on, int32, shape (E,). steps: until it was over, likewise.
-            last: of the longest.
+            the states. course: both of these for kernels. made: the same derivatives, with other
+            memory for the states.
+        obs: the actor's observations, shape (T, E, D).
+        landing: landing point of a payload that separates at a state [m], shape (T + 1, E, 2).
+        time: its time of flight [s], shape (T + 1, E).
+        mass, load_mass: masses of vehicles with their ropes and of payloads [kg], shape (E,).
+        mount: mounts of the ropes [m], shape (E, 3), body frame.
+        flying: whether a flight is in progress, int32, shape (E,).
+        steps: number of steps until a flight ended, int32, shape (E,). last: that of the longest.
     """
 
     def __init__(self, env: ThrowEnv, steps: int):
@@ -107,13 +108,11 @@ class FlightBatch:
         self.mass = self._body + self._rope
 
     def mark_flown_steps(self) -> Tensor:
-        """Whether a flight was not over at a step, bool, shape (T, E)."""
+        """Return whether each flight was in progress at each step, bool, shape (T, E)."""
         return torch.arange(len(self.obs), device=self.steps.device)[:, None] <= self.steps
 
     def fly(self, act: Callable[[int, Tensor], Tensor | None]) -> None:
-        """Fly from new starts under actions ``act(k, observations)``; where it has none, all
-        flights are over.
-        """
+        """Fly from new starts with the actions ``act(k, observations)``, until it returns None."""
         env = self.env
         x = self.x
         views = env.views
@@ -153,10 +152,10 @@ class FlightBatch:
 
 
 def fit(flights: FlightBatch) -> dict[str, Tensor]:
-    """Fit to random flights:
+    """Fit the surrogate's coefficients to flights with random commands.
 
-    ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), ``force``, kappa and drag [N s/m], shape
-    (4,), and ``tension``, a and b.
+    Returns ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), ``force``, kappa and drag
+    [N s/m], shape (4,), and ``tension``, a and b.
     """
     env = flights.env
     period = env.cfg.sim.control_period
@@ -184,7 +183,7 @@ def fit(flights: FlightBatch) -> dict[str, Tensor]:
 
 
 def _solve(features: Tensor, target: Tensor) -> Tensor:
-    """Least-squares coefficients; what nothing excites gets none."""
+    """Return the least-squares coefficients; those of features that are not excited are 0."""
     scale = features.square().mean(0).sqrt().clamp(min=1e-12)
     scaled = features / scale
     ridge = 1e-9 * len(features) * torch.eye(len(scale), dtype=scale.dtype, device=scale.device)
@@ -192,8 +191,8 @@ def _solve(features: Tensor, target: Tensor) -> Tensor:
 
 
 def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Tensor]:
-    """Rows of the three regressions from the whole steps of flights; those of the tension count
-    where the rope is taut.
+    """Return the rows of the three regressions from the complete steps of flights; rows of the
+    tension are 0 where the rope is slack.
     """
     f = flights.x
     mass = flights.mass

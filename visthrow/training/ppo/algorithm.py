@@ -1,4 +1,4 @@
-"""What every training algorithm is to the trainer that drives it."""
+"""The interface of the training algorithms."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -12,33 +12,31 @@ from visthrow.training.ppo.network import Network
 
 
 class Algorithm(ABC):
-    """A training algorithm, driven an iteration at a time.
+    """A training algorithm, which a trainer runs iteration by iteration.
 
-    Its constructor takes experiment, device, seed and ranks, builds environment, of this seed, and
-    networks, and raises ConfigError for what it cannot train. torch's generators are the caller's
-    to seed."""
+    Its constructor takes experiment, device, seed and ranks. It builds the environment, with this
+    seed, and the networks, and raises ConfigError for an experiment that the algorithm does not
+    support. The caller seeds torch's generators."""
 
     experiment: Experiment
-    env: ThrowEnv  # that it learns in
-    iterations: int  # of a whole training
-    samples: int  # environment steps an iteration, over all ranks
-    network: Network  # the actor, and the mean of its last weights, which is exported
-    average: AveragedModel
-    # attributes whose state the next iteration depends on, besides the environment's
+    env: ThrowEnv  # the training environment
+    iterations: int  # number of iterations in a whole training
+    samples: int  # environment steps in an iteration, over all ranks
+    network: Network  # the actor
+    average: AveragedModel  # mean of the actor's last weights, which is exported
+    # attributes that, with the environment, hold the state on which the next iteration depends
     parts: tuple[str, ...]
 
     @abstractmethod
     def collect(self, done: float) -> None:
-        """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for
-        schedules.
-        """
+        """Fly one batch; ``done``: finished share of the training, 0 to 1, for schedules."""
 
     @abstractmethod
     def learn(self, done: float) -> dict[str, float]:
-        """Learn from the last batch; returns figures for the log, of
-        :data:`visthrow.training.progress.COLUMNS` those that there are.
+        """Learn from the last batch; return figures for the log, some of
+        :data:`visthrow.training.progress.COLUMNS`.
 
-        Always there are the finished episodes' :meth:`ThrowEnv.episode_means`.
+        These always include the finished episodes' :meth:`ThrowEnv.episode_means`.
         """
 
     def export(self, contract: dict, made_by: dict) -> Policy:
@@ -47,19 +45,19 @@ class Algorithm(ABC):
         return Policy.from_actor_state(state, self.experiment.ppo.activation, contract, made_by)
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy that :func:`visthrow.training.trainer.adopt_layers` found to fit: its
-        weights, and its normaliser, which hardly moves from there.
+        """Start from a policy that passed :func:`visthrow.training.trainer.adopt_layers`: load its
+        weights, and its normaliser, which hardly changes afterwards.
         """
         for network in (self.network, self.average.module):
             network.take_up(policy)
 
     def state_dict(self) -> dict[str, Any]:
-        """Tensors and numbers that the next iteration depends on, besides torch's generators."""
+        """Return all state that the next iteration depends on, except torch's generators."""
         return {name: getattr(self, name).state_dict() for name in (*self.parts, "env")}
 
     def load_state_dict(self, saved: dict[str, Any], keep_throws: bool = True) -> None:
-        """Restore a state of :meth:`state_dict`, bit for bit. Without ``keep_throws`` episodes
-        start anew.
+        """Restore a state of :meth:`state_dict` to the bit. Without ``keep_throws`` the episodes
+        restart.
         """
         for name in (*self.parts, *["env"] * keep_throws):
             getattr(self, name).load_state_dict(saved[name])

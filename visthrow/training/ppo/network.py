@@ -1,5 +1,5 @@
-"""rsl_rl's network and Gaussian as a CUDA graph can hold them, with products in bfloat16 as a
-switch.
+"""Variants of rsl_rl's network and Gaussian that a CUDA graph can capture, with optional bfloat16
+products.
 """
 
 import math
@@ -18,32 +18,32 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
-# observations that the normaliser of a policy counts for when it is taken up: about as many as in
-# its training, which its file does not state
+# count of observations that a loaded policy's normaliser is assumed to have seen: about as many as
+# in its training; the file does not state the number
 OBSERVED = 10**8
 
 
 def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:
-    """State of rsl_rl's normaliser after :data:`OBSERVED` observations of this mean and spread,
-    shape (D,).
+    """Return the state of rsl_rl's normaliser after :data:`OBSERVED` observations of this mean and
+    spread, shape (D,).
     """
     state = {"_mean": mean, "_std": std, "_var": std.square()}
     return {name: value[None] for name, value in state.items()} | {"count": torch.tensor(OBSERVED)}
 
 
 class CapturableGaussian(GaussianDistribution):
-    """rsl_rl's Gaussian with a sample that a CUDA graph can hold: torch.normal copies its spread's
-    minimum to the host.
+    """rsl_rl's Gaussian with a sampling method that a CUDA graph can capture; torch.normal copies
+    the minimum of the spread to the host.
     """
 
     def sample(self) -> Tensor:
-        """Sample of the current distribution."""
+        """Return a sample of the current distribution."""
         return self.mean + self.std * torch.randn_like(self.mean)
 
 
 class Network(MLPModel):
-    """rsl_rl's network whose hidden layers multiply in bfloat16 where asked; weights and the last
-    layer stay float32.
+    """rsl_rl's network with optional bfloat16 products in the hidden layers; the weights and the
+    last layer remain float32.
     """
 
     def __init__(self, *args, bfloat16: bool = False, **kwargs):
@@ -53,8 +53,8 @@ class Network(MLPModel):
     def forward(
         self, obs: TensorDict, masks=None, hidden_state=None, stochastic_output: bool = False
     ) -> Tensor:
-        """Output for observations; a sample of the distribution where
-        ``stochastic_output`` is set.
+        """Return the output for observations; with ``stochastic_output`` a sample of the
+        distribution.
         """
         *layers, last = self.mlp
         latent = self.get_latent(obs)
@@ -68,8 +68,8 @@ class Network(MLPModel):
         return self.distribution.sample()
 
     def update_normalization(self, obs: TensorDict) -> None:
-        """rsl_rl's update of the observations' statistics; it makes a new tensor of the spread,
-        graphs read the old one.
+        """Update the observations' statistics as rsl_rl does, but in place: captured graphs read
+        the old tensor of the spread.
         """
         if self.obs_normalization:
             captured = self.obs_normalizer._std
@@ -78,8 +78,8 @@ class Network(MLPModel):
 
     @torch.no_grad()
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: its weights, and its normaliser, which hardly
-        moves from there.
+        """Start from a policy with the same layers: load its weights, and its normaliser, which
+        hardly changes afterwards.
         """
         layers = self._linear_layers()
         for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
@@ -95,18 +95,19 @@ class Network(MLPModel):
 
     @property
     def matrices(self) -> list[Tensor]:
-        """Weights of the hidden layers."""
+        """Return the weight matrices of the hidden layers."""
         return [layer.weight for layer in self._linear_layers()[:-1]]
 
 
 class MuonAdam(torch.optim.Adam):
-    """Adam whose weight matrices step along their orthogonalised momentum, at the same learning
-    rate. Zero the gradients on the network: ``zero_grad`` leaves those of the matrices.
+    """Adam, with Muon for weight matrices: they step along their orthogonalised momentum, at the
+    same learning rate. ``zero_grad`` does not reset the gradients of the matrices; zero the
+    gradients through the network.
 
-    Source: K. Jordan et al., Muon, 2024; the steps' size: Liu et al., arXiv:2502.16982."""
+    Source: K. Jordan et al., Muon, 2024; step size: Liu et al., arXiv:2502.16982."""
 
     def __init__(self, parameters: Iterable[Tensor], matrices: Iterable[Tensor], **options: Any):
-        """Step the ``matrices`` among the parameters by Muon and the others by Adam, with these
+        """Optimise the ``matrices`` among the parameters by Muon and the others by Adam with these
         ``options``.
         """
         self._matrices = list(matrices)
@@ -117,20 +118,21 @@ class MuonAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:
-        """Take a step."""
+        """Take one step of both optimisers."""
         super().step()
         before = [matrix.clone() for matrix in self._matrices]
         self._muon.step()
-        # Muon's rate cannot live on the device, as graphs need it: scale steps of rate 1
+        # a captured graph needs the rate on the device, which Muon does not support: scale its
+        # steps of rate 1
         for matrix, old in zip(self._matrices, before):
             matrix.copy_(torch.lerp(old, matrix, self.param_groups[0]["lr"]))
 
     def state_dict(self) -> dict:
-        """State of both."""
+        """Return the state of both optimisers."""
         return super().state_dict() | {"muon": self._muon.state_dict()}
 
     def load_state_dict(self, state_dict: dict) -> None:
-        """Take up a state of :meth:`state_dict`."""
+        """Restore a state of :meth:`state_dict`."""
         entries = dict(state_dict)
         self._muon.load_state_dict(entries.pop("muon"))
         super().load_state_dict(entries)
@@ -139,8 +141,8 @@ class MuonAdam(torch.optim.Adam):
 def cosine_rate(
     optimizer: torch.optim.Optimizer, done: float, highest: float, lowest: float
 ) -> float:
-    """Set the learning rate at this share of the training, half a cosine from the highest to the
-    lowest one.
+    """Set and return the learning rate after a share ``done`` of the training, which falls from the
+    highest to the lowest one as half a cosine.
     """
     rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
@@ -149,11 +151,11 @@ def cosine_rate(
 
 
 def average_weights(module: torch.nn.Module, window: int) -> AveragedModel:
-    """Return the running mean of a module's weights over the last quarter of its updates,
-    ``window`` of them at most.
+    """Return the running mean of a module's weights over the last quarter of its updates, at most
+    ``window`` of them.
 
-    One gradient step throws off what many agree on, and a throw's bias with it. Source: Polyak and
-    Juditsky, SIAM J. Control and Optimization 30(4), 1992."""
+    Averaging removes the noise of single gradient steps, which would bias the throws. Source:
+    Polyak and Juditsky, SIAM J. Control and Optimization 30(4), 1992."""
 
     def move_mean(mean: Tensor, current: Tensor, updates: Tensor) -> Tensor:
         return mean + (current - mean) * torch.clamp(4.0 / (updates + 4.0), min=1.0 / window)

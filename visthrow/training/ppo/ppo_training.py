@@ -1,4 +1,4 @@
-"""PPO on the throwing task, as a trainer drives it."""
+"""Train on the throwing task by PPO."""
 
 import contextlib
 import io
@@ -16,15 +16,13 @@ from visthrow.training.ppo.network import CapturableGaussian, Network, average_w
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
 
-AVERAGED = 10  # iterations that the exported weights are a mean of, at most
+AVERAGED = 10  # longest window of iterations over which the exported weights are averaged
 
-WARM_UP_RATE = 2e-3  # learning rate of a critic that learns alone; nothing that it moves is flown
+WARM_UP_RATE = 2e-3  # learning rate while only the critic learns, which does not act
 
 
 def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
-    """Return the configuration dictionary of rsl_rl 5.5 for our parameters; both observation groups
-    are named.
-    """
+    """Return the configuration dictionary of rsl_rl 5.5 for our parameters."""
     network = {
         "class_name": Network,
         "activation": p.activation,
@@ -58,14 +56,14 @@ def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
 
 
 class PPOTraining(Algorithm):
-    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``."""
+    """PPO on :class:`ThrowEnv` with rsl_rl's algorithm object, ``alg``."""
 
     parts = ("alg", "average")
 
     def __init__(
         self, experiment: Experiment, device: str, seed: int, ranks: Ranks, build: Any = ThrowEnv
     ):
-        """Build environment and networks; ``build`` makes the environment, as the class does."""
+        """Build the environment, by ``build`` with the class's arguments, and the networks."""
         p = experiment.ppo
         if (p.environments * p.steps) % p.minibatches:
             raise ConfigError(
@@ -86,7 +84,7 @@ class PPOTraining(Algorithm):
         self.network = self.alg.actor
         self.average = average_weights(self.network, AVERAGED)
         self._obs = env.get_observations()
-        # a solver whose work cannot be captured is launched
+        # some solvers cannot be captured in a graph; their steps are launched one by one
         capturable = device.startswith("cuda") and env.sim.capturable
         self.rollout = ReplayedGraph(self._rollout) if capturable else self._rollout
 
@@ -116,8 +114,8 @@ class PPOTraining(Algorithm):
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
 
     def _warm_up(self, iteration: int) -> None:
-        """Let the critic alone learn in the first iterations, faster, and the actor from there at
-        the rate that is set.
+        """Let only the critic learn in the first iterations, at a higher rate; afterwards both
+        learn at the configured rate.
         """
         first = self.experiment.ppo.critic_first
         if first and iteration in (0, first):

@@ -1,4 +1,4 @@
-"""rsl_rl's PPO with an update that a CUDA graph can hold."""
+"""rsl_rl's PPO with an update that a CUDA graph can capture."""
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -9,13 +9,13 @@ from torch import Tensor
 from sim.torch_bridge import ReplayedGraph
 from visthrow.training.ppo.network import MuonAdam, Network
 
-# range of the adaptive learning rate
+# limits of the adaptive learning rate
 SLOWEST = 1e-5
 FASTEST = 1e-2
 
 
 class CapturedPPO(PPO):
-    """rsl_rl's PPO of networks without memory, whose learning rate lives on the device."""
+    """rsl_rl's PPO for feedforward networks, with the learning rate in device memory."""
 
     def __init__(self, actor: Network, critic: Network, storage, muon: bool = False, **settings):
         """Take rsl_rl's settings; ``muon``: see :class:`PPOParams`."""
@@ -25,7 +25,7 @@ class CapturedPPO(PPO):
         self._parameters = [*actor.parameters(), *critic.parameters()]
         self.rate = torch.tensor([self.learning_rate], device=device)
         self.target_kl = torch.tensor([self.desired_kl], device=device)
-        # 0 holds the actor still, to the bit, while the critic learns
+        # at 0 the actor stays constant, to the bit, while the critic learns
         self.actor_learns = torch.ones(1, device=device)
         options = {"lr": self.rate, "fused": True, "capturable": self._cuda}
         if muon:
@@ -37,17 +37,17 @@ class CapturedPPO(PPO):
         self._capture()
 
     def _capture(self) -> None:
-        """Launch the next update, and replay those after it from a graph, on a GPU."""
+        """Prepare updates: on a GPU the next is launched, later ones are replayed from a graph."""
         self.descend = ReplayedGraph(self._epochs) if self._cuda else self._epochs
 
     def compute_returns(self, obs: TensorDict) -> None:
-        """Compute returns and advantages in place: graphs go on reading the same memory."""
+        """Compute returns and advantages in place, because captured graphs read this memory."""
         advantages = self.storage.advantages
         super().compute_returns(obs)
         self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
-        """All epochs over the stored samples; returns mean losses."""
+        """Learn from the stored samples in all epochs; return mean losses."""
         self.target_kl.fill_(self.desired_kl)
         self.descend()
         for model in (self.actor, self.critic):
@@ -62,7 +62,7 @@ class CapturedPPO(PPO):
         return {name: total / count for name, total in losses} | {"spread": spread}
 
     def _epochs(self) -> None:
-        """Descend on each minibatch of the samples, once an epoch."""
+        """Take a gradient step on each minibatch of the samples, in each epoch."""
         self._totals.zero_()
         for batch in self.storage.mini_batch_generator(
             self.num_mini_batches, self.num_learning_epochs
@@ -100,8 +100,8 @@ class CapturedPPO(PPO):
 
     @torch.no_grad()
     def _adapt_rate(self, old_distribution: tuple[Tensor, ...]) -> None:
-        """Make the learning rate smaller or larger by the divergence of a minibatch from its
-        rollout; means and spreads of shape (N, A).
+        """Adapt the learning rate to the divergence of the policy on a minibatch from that of the
+        rollout, whose means and spreads have shape (N, A).
         """
         if self.schedule != "adaptive":
             return
@@ -119,15 +119,15 @@ class CapturedPPO(PPO):
     state_dict = PPO.save
 
     def load_state_dict(self, saved: dict) -> None:
-        """Take up a state of :meth:`state_dict`; the rate keeps its place on the device, graphs are
-        captured anew.
+        """Restore a state of :meth:`state_dict`; the learning rate stays in the same device memory,
+        and graphs are captured again.
         """
         self.load(saved, None, True)
         self.set_rate(float(self.learning_rate))
         self._capture()
 
     def set_rate(self, rate: float) -> None:
-        """Go on with this learning rate."""
+        """Set the learning rate of the next steps."""
         self.learning_rate = rate
         self.rate.fill_(rate)
         for group in self.optimizer.param_groups:
