@@ -1,1 +1,1 @@
-"""Throws on either plant: one throw, many throws, and what is made of their results."""
+"""Fly throws on either plant, single ones and batches, and load recorded throws."""

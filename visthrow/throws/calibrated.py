@@ -1,9 +1,8 @@
-"""Throws in the training simulator that begin as a runner's with an uncalibrated camera: a hover, a
-sway, a calibration.
+"""Start throws in the training simulator with a camera calibration in hover, as the runner does.
 
-What the simulator draws of each vehicle and its camera stays the same in the hover and in the
-throw. The calibration is given what the actor measures, with its noise, and where the goal is, as a
-motion-capture hall has it."""
+The simulator's random draws for each vehicle and its camera are the same in the hover and in the
+throw. The calibration uses the actor's measurements with their noise and the exact position of the
+goal, which motion capture knows."""
 
 from collections.abc import Callable
 from functools import partial
@@ -28,19 +27,19 @@ if TYPE_CHECKING:
 
     from visthrow.training.env import ThrowEnv
 
-SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
-# calibrations of half a second each: here they are done before other processes have started
+SETTLE = 3.0  # time after the sway [s]; about 10 deg of its swing remain
+# calibrations of half a second each that are finished before other processes would have started
 TOO_FEW = 8
 
 
 def start_calibrated(
     experiment: Experiment, records: list[Calibration | None] | None = None
 ) -> "Callable[[ThrowEnv], TensorDict]":
-    """Return the start of :func:`visthrow.training.protocol.throw`; ConfigError for another layout
-    than vision, or goals that move.
+    """Return a function that calibrates in hover, the ``begin`` of
+    :func:`visthrow.training.protocol.throw`.
 
-    ``records`` receives the calibration of each throw, or None where there was none: its keypoints
-    stay uncorrected."""
+    ``records`` receives the calibration of each throw, or None if the calibration failed; then the
+    keypoints are not corrected. Raises ConfigError: the layout is not vision, or goals move."""
     observation = experiment.task.observation
     if observation.layout != "vision" or experiment.task.target.moves:
         raise ConfigError(
@@ -61,7 +60,7 @@ def start_calibrated(
 
 
 def _hover(env: "ThrowEnv") -> list[Hovered]:
-    """Hover, sway and settle; what was measured till the end of the sway, of each vehicle."""
+    """Hover, sway and settle; return each vehicle's measurements up to the end of the sway."""
     cfg = env.cfg
     period = env.cfg.sim.control_period
     steps = round((HOVER + SWAY) / period)
@@ -92,8 +91,8 @@ def _hover(env: "ThrowEnv") -> list[Hovered]:
 
 
 def _measure(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
-    """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of
-    this step.
+    """Return this step's measured position, attitude xyzw, velocity, body rates, keypoints
+    (E, 8, 2) and validity (E, 8).
     """
     frame, valid = (part.cpu() for part in env.measured)
     vehicle = frame[:, : ob.VEHICLE].double().numpy()
@@ -104,7 +103,7 @@ def _measure(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
 
 
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
-    """Return the calibration of each hover; None where it shows too little."""
+    """Return the calibration of each hover; None where its data did not suffice."""
     solve = partial(try_calibration, camera=experiment.camera, contract=contract_of(experiment))
     processes = cores() if len(hovered) > TOO_FEW else 1
     estimates = dict(done(solve, hovered, processes, "calibrations"))

@@ -1,8 +1,8 @@
-"""The flight loop: the vehicles of a plant hover, throw and recover, a batch of them or one.
+"""The flight loop: the vehicles of a plant, one or a batch, hover, throw and recover.
 
 A flight is a sequence of phases. In a hover the hover controller flies all vehicles. In a throw the
-pilots fly vehicles with their payload, and the hover controller, which runs along, those that have
-released or failed. A recorder gets each period."""
+pilots fly the vehicles that carry their payload, and the hover controller, which always runs, flies
+those that have released or failed. A recorder receives each period."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,17 +22,17 @@ from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
 
 FALL_TIME = 1.5
-"""Longest flight after separation that is waited for [s]."""
+"""Longest flight of a payload before its throw counts as failed [s]."""
 
 LOOK_EVERY = 8
-"""Periods of a hover between two looks at pictures."""
+"""Control periods between pictures in a hover."""
 
 VIEWS = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
-"""What a policy is shown of a vehicle."""
+"""Measured quantities of a vehicle that a policy receives."""
 
 
 class Sight(Protocol):
-    """A camera and a detector on each of E vehicles: keypoints from pictures.
+    """A camera and a detector on each of E vehicles, which find keypoints in pictures.
 
     Attributes:
         last_keypoints: keypoints and validity of the last picture, (E, 8, 2) and (E, 8).
@@ -46,12 +46,16 @@ class Sight(Protocol):
         """Take a picture on each vehicle and return ``last_keypoints``.
 
         Args:
-            snapshot: true states. measured: states that the detector knows attitude and height of.
-            goal_w: goals [m], shape (E, 3), world frame. carried: whether a payload hangs, (E,).
+            snapshot: true states. measured: states from which the detector knows attitude and
+                height.
+            goal_w: goals [m], shape (E, 3), world frame. carried: whether a payload is attached,
+                shape (E,).
         """
 
     def lost(self) -> dict[int, str]:
-        """Return vehicle -> "ball" or "goal", whichever the hover's pictures did not show."""
+        """Return vehicle -> the object, "ball" or "goal", that the hover's pictures did not
+        show.
+        """
 
 
 @dataclass(frozen=True)
@@ -59,14 +63,14 @@ class Decision:
     """The commands of E vehicles for one period."""
 
     command: ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
-    release: ndarray  # whether the latch is to trip, shape (E,), bool
-    # the normalised command, and a policy's release output, shape (E, 4 or 5)
+    release: ndarray  # whether to trip the latch, shape (E,), bool
+    # the normalised command and a policy's release output, shape (E, 4 or 5)
     action: ndarray | None = None
     observation: ndarray | None = None  # of a policy, shape (E, D)
 
 
 class Pilots(ABC):
-    """The pilots of E vehicles; the children decide."""
+    """The pilots of E vehicles; subclasses decide their commands."""
 
     def __init__(
         self,
@@ -75,11 +79,12 @@ class Pilots(ABC):
         first_action: ndarray,
         goal_vel_w: ndarray | None = None,
     ):
-        """Begin before the throw, within the experiment's bounds.
+        """Prepare for a throw.
 
         Args:
-            experiment: see above.
-            goal_w: at its start [m], shape (E, 3). goal_vel_w: [m/s], shape (E, 3); None: still.
+            experiment: experiment whose bounds apply.
+            goal_w: goals at the start of the throw [m], shape (E, 3). goal_vel_w: their velocities
+                [m/s], shape (E, 3); None for goals that do not move.
             first_action: normalised command of the hover before, shape (E, 4 or 5).
         """
         self.experiment = experiment
@@ -89,21 +94,19 @@ class Pilots(ABC):
 
     @abstractmethod
     def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
-        """Decide for all vehicles, of which those of ``flight.flown`` follow; ``latched`` are the
-        hover controller's commands.
+        """Return the commands for all vehicles, of which those in ``flight.flown`` follow them;
+        ``latched``: the hover controller's commands, shape (E, 4).
         """
 
     def wait(self, flight: "Flight", snapshot: Snapshot) -> dict[int, str]:
-        """Vehicles that are not to throw if the hover ended here, and why; called each period of
-        the hover before the throw.
+        """Return vehicle -> the reason why it must not throw if the hover ended now; called in each
+        period of the hover before the throw.
         """
         return {}
 
 
 class Policies(Pilots):
-    """Learnt policies that share a batch, each with the same number of vehicles, the first policy's
-    first.
-    """
+    """Learnt policies that share a batch; each flies the same number of consecutive vehicles."""
 
     def __init__(
         self,
@@ -113,10 +116,10 @@ class Policies(Pilots):
         draws: bool = False,
         eyes: Sight | None = None,
     ):
-        """Begin with policies that were trained for one plant; goals as of `Pilots`.
+        """Prepare policies that were trained for the same plant; goals: see `Pilots`.
 
-        ``draws``: state policies too have a camera, to be drawn. ``eyes``: whose rendered pictures
-        keypoints come from; None: they are what measured poses project to."""
+        ``draws``: state policies have a camera too, for drawing. ``eyes``: source of keypoints from
+        rendered pictures; None to project measured poses."""
         self.eyes = eyes
         self._waited = 0
         self._lost = {}
@@ -160,27 +163,27 @@ class Policies(Pilots):
 
 
 class FlightObserver:
-    """Keeps nothing of a flight; the children do."""
+    """An observer of a flight that records nothing; subclasses record."""
 
     def before(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
-        """Take each period's measurement and command, before the plant moves."""
+        """Receive a period's measurement and command before the plant advances."""
 
     def after(self, flight: "Flight", snapshot: Snapshot, sent: Decision) -> None:
-        """Take the period's end, with the new state in ``flight.now``."""
+        """Receive the end of a period, with the new state in ``flight.now``."""
 
 
 @dataclass(frozen=True)
 class Phase:
-    """Part of a flight."""
+    """A part of a flight."""
 
-    # whether the pilots fly, or the hover controller, which begins with empty integrals
+    # whether the pilots fly; otherwise the hover controller does, with its integrals reset
     throws: bool
-    over: Callable[["Flight"], bool]  # asked after each period
+    over: Callable[["Flight"], bool]  # whether the phase is over, called after each period
 
 
 def throw(seconds: float | None = None) -> Phase:
-    """Throw until every payload has landed or its throw has failed, at most for a time [s]; default
-    what the bounds allow.
+    """Return the phase of a throw, which lasts until every payload has landed or its throw has
+    failed, at most for a time [s]; default the longest time within the bounds.
     """
 
     def is_over(flight: "Flight") -> bool:
@@ -194,7 +197,7 @@ def throw(seconds: float | None = None) -> Phase:
 
 
 def hover(seconds: float) -> Phase:
-    """Hover for a time [s]."""
+    """Return the phase of a hover for a time [s]."""
     return Phase(False, lambda flight: flight.has_lasted(seconds))
 
 
@@ -202,12 +205,12 @@ class Flight:
     """E vehicles of a plant in flight.
 
     Attributes:
-        elapsed: since the phase began [s].
-        begin: when the first throw began, on the plant's clock [s]; NaN before it.
-        open: whose throw is neither over nor failed, shape (E,). flown: whom the pilots fly in this
-            period, shape (E,).
-        failed: shape (E,), bool. failures: why, a message or None for each.
-        commands: that were sent, each of shape (E, 4).
+        elapsed: time since the phase began [s].
+        begin: start of the first throw on the plant's clock [s]; NaN before it.
+        open: whether a throw is neither over nor failed, shape (E,). flown: whether the pilots fly
+            the vehicle in this period, shape (E,).
+        failed: whether the throw has failed, shape (E,). failures: a message or None for each.
+        commands: the commands sent in each period, shape (E, 4).
     """
 
     def __init__(
@@ -217,10 +220,10 @@ class Flight:
         recorder: FlightObserver | None = None,
         home_w: ndarray | None = None,
     ):
-        """Take over a plant at its start; the recorder receives each period.
+        """Prepare the flight of a plant from its present state; the recorder receives each period.
 
-        ``home_w``: place that the hover controller holds [m], shape (3,) or (E, 3); None: where the
-        vehicles are."""
+        ``home_w``: set-point of the hover controller [m], shape (3,) or (E, 3); default the
+        vehicles' positions."""
         count = plant.count
         self.plant = plant
         self.pilots = pilots
@@ -242,7 +245,7 @@ class Flight:
 
     @property
     def now(self) -> Snapshot:
-        """State of the plant, read at most once a period."""
+        """Return the state of the plant, read at most once a period."""
         self._now = self._now or self.plant.state
         return self._now
 
@@ -251,15 +254,17 @@ class Flight:
         return self.plant.time - self._phase_begin
 
     def has_lasted(self, time: float) -> bool:
-        """Whether the phase has lasted for a time [s], to the nearest period."""
+        """Return whether the phase has lasted for a time [s], to the nearest period."""
         return self.elapsed > time - 0.5 * self.plant.period
 
     def goal_at(self, time: float | ndarray) -> ndarray:
-        """Goals [m], shape (E, 3), at a time or a time each on the plant's clock [s]."""
+        """Return the goals' positions [m], shape (E, 3), at a time on the plant's clock [s], one
+        for all or shape (E,).
+        """
         return self.pilots.goal_w + np.reshape(time - self.begin, (-1, 1)) * self.pilots.goal_vel_w
 
     def run(self, phases: Sequence[Phase]) -> None:
-        """Fly one phase after the other, each for a period at least."""
+        """Fly the phases in sequence, each for at least one period."""
         for phase in phases:
             self._phase_begin = self.plant.time
             if not phase.throws:
@@ -274,12 +279,12 @@ class Flight:
                 self._period(phase.throws)
 
     def fail(self, vehicle: int, cause: str) -> None:
-        """Note that a vehicle's throw has failed, unless it had before."""
+        """Mark a vehicle's throw as failed; its first cause is kept."""
         self.failed[vehicle] = True
         self.failures[vehicle] = self.failures[vehicle] or cause
 
     def _period(self, throws: bool) -> None:
-        """Measure, decide, send."""
+        """Fly one control period: measure, decide and send."""
         plant = self.plant
         measurement = plant.measured()
         hold_command = self._command_hover(measurement)
@@ -301,13 +306,13 @@ class Flight:
         self.recorder.after(self, measurement, sent)
 
     def _command_hover(self, snapshot: Snapshot) -> ndarray:
-        """Commands of the hover controller."""
+        """Return the hover controller's commands, shape (E, 4)."""
         plant = self.plant.params
         mass = plant.vehicle.body.mass + np.where(snapshot.attached, plant.rope.hanging_mass, 0.0)
         return self._hover.step(snapshot.pos_w, snapshot.quat_wb, snapshot.vel_w, self.home_w, mass)
 
     def judge(self, snapshot: Snapshot) -> None:
-        """Note whose throw has failed or is over, by the state after a period."""
+        """Mark throws that have failed or are over, from the state after a period."""
         plant = self.plant
         landing = self.plant.landing
         carrying = self.flown & snapshot.attached
@@ -320,8 +325,8 @@ class Flight:
         self.open &= ~(self.failed | landing.landed)
 
     def _causes(self, snapshot: Snapshot) -> dict[str, ndarray]:
-        """Which throws have ended early, by cause, the first that holds first: the ends of an
-        episode of training.
+        """Return cause -> whether it ended a throw early, shape (E,). The causes are those that end
+        an episode of training; the first that applies counts.
         """
         experiment = self.pilots.experiment
         pos_w = snapshot.pos_w
@@ -346,34 +351,34 @@ class Smoothness:
     """Root mean square change of normalised commands from step to step."""
 
     def __init__(self, first: ndarray):
-        """Begin with the command before the first, shape (E, 4 or more)."""
+        """Start with the command before the first one, shape (E, 4 or more)."""
         self._last = first
         self._sum = np.zeros(len(first))
         self._steps = np.zeros(len(first))
 
     def add(self, action: ndarray, active: ndarray | bool = True) -> None:
-        """Count normalised commands, shape (E, 4 or more), of vehicles that are being flown."""
+        """Add normalised commands, shape (E, 4 or more), of the vehicles in ``active``."""
         self._sum += active * np.mean((action - self._last)[:, :4] ** 2, axis=1)
         self._steps += active
         self._last = action
 
     @property
     def value(self) -> ndarray:
-        """Shape (E,)."""
+        """Return the root mean square change so far, shape (E,)."""
         return np.sqrt(self._sum / np.maximum(self._steps, 1.0))
 
 
 class Scores(FlightObserver):
-    """Measures what :class:`visthrow.task.measurement.Throws` holds.
+    """An observer that measures the results of :class:`visthrow.task.measurement.Throws`.
 
     Attributes:
-        clearance: least distance of the payload from the vehicle in flight [m], shape (E,);
+        clearance: smallest distance between the flying payload and the vehicle [m], shape (E,);
             infinite before.
-        smoothness: of the pilots' commands.
+        smoothness: smoothness of the pilots' commands.
     """
 
     def __init__(self, pilots: Pilots):
-        """Begin before the throw."""
+        """Prepare for a throw."""
         self.clearance = np.full(len(pilots.goal_w), np.inf)
         self.smoothness = Smoothness(pilots.first_action)
 
@@ -387,7 +392,9 @@ class Scores(FlightObserver):
         self.clearance = np.where(flying, np.minimum(self.clearance, distance), self.clearance)
 
     def columns(self, flight: Flight) -> dict[str, ndarray]:
-        """Return a row a throw, NaN where it failed; ``goal_w`` where goals move."""
+        """Return columns with one row for each throw, NaN if it failed; with ``goal_w`` if goals
+        move.
+        """
         landing = flight.plant.landing
         success = landing.landed & ~flight.failed
         point = landing.point_w[:, :2]

@@ -1,5 +1,5 @@
-"""Throws of HIL runs, from the flight logs in their folders, as the tables of simulated throws want
-them.
+"""Load throws of HIL runs from the flight logs in their folders, in the form of simulated
+throws.
 """
 
 from collections.abc import Iterable
@@ -15,12 +15,13 @@ from visthrow.task.measurement import Entry, Throws
 
 PATTERN = "throw-*.npz"
 
-MOST_NAMES = 10  # of files that an error names
+MOST_NAMES = 10  # largest number of files listed in an error
 
 
 def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
-    """Return logs of all throws of some runs; LogError for a folder without throws, or a damaged
-    log.
+    """Return the logs of all throws of some runs.
+
+    Raises LogError: a folder has no throws, or a log is damaged.
     """
     logs: list[FlightLog] = []
     for folder in map(Path, folders):
@@ -44,7 +45,9 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
 
 
 def note(logs: list[FlightLog]) -> str:
-    """Return what flew the paper's throws, and what flew these as far as their folders say."""
+    """Return a note for tables: whether the paper's throws and these were flown by real or
+    simulated vehicles, as far as their folders state it.
+    """
     text = "The paper's figures are ten throws a target of its vehicle."
     simulated = sum(bool(log.meta.get("provenance", {}).get("simulated")) for log in logs)
     if simulated == len(logs):
@@ -57,8 +60,8 @@ def note(logs: list[FlightLog]) -> str:
 
 
 def entries(logs: list[FlightLog]) -> list[Entry]:
-    """Return an entry a policy, its throws by the distance of their goals; policies of one name and
-    other content are distinguished.
+    """Return one entry for each policy, with its throws by distance of the goal. Policies with the
+    same name but different content are separate.
     """
     groups: dict[tuple[str, str, str], dict[float, list[FlightLog]]] = {}
     for log in logs:
@@ -81,13 +84,13 @@ def entries(logs: list[FlightLog]) -> list[Entry]:
 
 
 def _offset(log: FlightLog) -> np.ndarray:
-    """Offset from the hover point to the goal [m], shape (2,)."""
+    """Return the offset from the hover point to the goal [m], shape (2,)."""
     return np.array(log.meta["goal_w"][:2]) - np.array(log.meta["home_w"][:2])
 
 
 def _throws(target: float, logs: list[FlightLog]) -> Throws:
-    """Throws at one distance; landing points along the throw and across it, from where the vehicle
-    hovered.
+    """Return the throws at one distance, with landing points along and across the direction of the
+    throw, relative to the hover point.
     """
     columns = np.array([_row(log) for log in logs], dtype=float).reshape(-1, 5)
     error, duration, smooth = columns.T[2:]
@@ -97,8 +100,8 @@ def _throws(target: float, logs: list[FlightLog]) -> Throws:
 
 
 def _row(log: FlightLog) -> tuple[float, ...]:
-    """Landing along and across, error, duration, smoothness; NaN for a throw that
-    counts as failed.
+    """Return landing point along and across, error, duration and smoothness; NaN if the throw
+    failed.
     """
     result = log.meta["result"]
     if not result["success"]:
@@ -118,8 +121,8 @@ def _row(log: FlightLog) -> tuple[float, ...]:
 
 
 def smoothness(log: FlightLog) -> float:
-    """Root mean square change of the normalised commands from step to step of a throw, as
-    `visthrow.training.protocol` has it.
+    """Return the root mean square change of a throw's normalised commands from step to step,
+    defined as in `visthrow.training.protocol`.
     """
     times = log.meta["times"]
     actions = log["action"]

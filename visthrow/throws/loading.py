@@ -1,4 +1,4 @@
-"""A policy together with the experiment that it is flown in."""
+"""Load a policy together with the experiment in which it is flown."""
 
 import re
 from collections.abc import Collection, Iterable
@@ -18,12 +18,12 @@ Kind = TypeVar("Kind", bound=Experiment)
 
 @dataclass(frozen=True)
 class Loaded:
-    """A policy, what to call it, and the experiment (plant, camera, task) that it is flown in."""
+    """A policy, its name, and the experiment (plant, camera, task) in which it is flown."""
 
     name: str
     policy: Policy
     experiment: Experiment
-    # where that breaks the contract by allowance: dotted key -> value flown with
+    # allowed deviations from the contract: dotted key -> value in flight
     departures: dict[str, Any] = field(default_factory=dict)
 
 
@@ -33,26 +33,26 @@ def load_policy(
     overrides: Iterable[str] = (),
     allow: Collection[str] = (),
 ) -> Loaded:
-    """Load a policy and the experiment that it was trained in, or another one that fits its
+    """Load a policy and the experiment of its training, or another experiment that satisfies its
     contract.
 
-    Raises PolicyError: no such policy, or it does not carry its config and none was named;
-    MismatchError: the config breaks the policy's contract; the message names every difference;
-    ConfigError: a wrong config or override, or a part that no contract has.
+    Raises PolicyError: no such policy, or it does not contain its config and none was given;
+    MismatchError: the config violates the policy's contract; the message names every difference;
+    ConfigError: an invalid config or override, or a part that no contract has.
 
     Args:
-        name: of a shipped policy, or a file.
-        config_name: a config of ``configs/train`` to fly in instead of the policy's own, as its
-            training says that it is flown.
-        overrides: ``key=value`` changes of that config.
-        allow: parts of the contract that may be broken, as of
+        name: name of a shipped policy, or a file.
+        config_name: config of ``configs/train`` to fly in; default the policy's own, with the
+            changes under which it is flown.
+        overrides: ``key=value`` changes of this config.
+        allow: parts of the contract that may be violated; see
             :meth:`visthrow.onboard.policy.Policy.require`.
     """
     path = find_policy(name)
     policy = _add_air_and_laws(Policy.load(path))
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
-        # of the program, not of the camera
+        # a property of the program, not of the camera
         trained = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
         experiment = load_experiment(config_name, [*trained, *overrides])
     else:
@@ -67,12 +67,13 @@ def load_policy(
             key: value for key, value in departures.items() if key.split("[")[0] not in widened
         }
     except MismatchError as error:
-        whole = dict.fromkeys(key.split("[")[0] for key in error.keys)  # a shell expands brackets
+        # a shell would expand brackets
+        whole = dict.fromkeys(key.split("[")[0] for key in error.keys)
         allowing = " ".join(f"--allow {key}" for key in whole)
         raise MismatchError(
             f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
         ) from None
-    if experiment.fleet is not None:  # one vehicle is flown, that of the config
+    if experiment.fleet is not None:  # fly one vehicle, that of the config
         policy, experiment = specialise(policy, changed(experiment, {"fleet.count": 0}))
     return Loaded(
         path.stem if path.stem != "policy" else path.resolve().parent.name,
@@ -83,7 +84,7 @@ def load_policy(
 
 
 def _add_air_and_laws(policy: Policy) -> Policy:
-    """Return a policy whose contract holds the air and the laws of its training: in older files
+    """Return the policy with the air and the laws of its training in its contract; in older files
     only the config states them.
     """
     trained = policy.made_by.get("config")
@@ -97,7 +98,7 @@ def _add_air_and_laws(policy: Policy) -> Policy:
 
 
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
-    """Raise ConfigError where a part that may be broken is in no contract."""
+    """Raise ConfigError if a part that may be violated is in no contract."""
     keys = {key for contract in contracts for key in flatten(contract)}
     groups = {key[: mark.start()] for key in keys for mark in re.finditer(r"[.\[]|$", key)}
     if part not in groups:
@@ -114,18 +115,18 @@ def training_experiment(
     overrides: Iterable[str],
     kind: type[Kind] = Experiment,  # type: ignore[assignment]
 ) -> Kind:
-    """Experiment that a policy was trained in, as its training says that it is flown, with changes;
-    ``kind`` is its schema.
+    """Return the experiment of a policy's training, with the changes under which it is flown and
+    further ``overrides``; ``kind`` is its schema.
 
-    Raises PolicyError: the policy does not carry its config.
+    Raises PolicyError: the policy does not contain its config.
     """
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         raise PolicyError(
             f"{path} does not carry the config it was trained with; name one with --config"
         )
-    # Learning parameters are today's: they play no part in flight, and an older policy may lack a
-    # newer one.
+    # Learning parameters are the current ones: they do not affect flight, and an older policy may
+    # lack some of them.
     layout = policy.contract.get("observation", {}).get("layout", "state")
     learning = config.to_dict(load_experiment(layout).ppo)
     return config.load_dict(
@@ -137,8 +138,8 @@ def training_experiment(
 
 
 def _list_allowed(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
-    """Keys of the contract that differ, but no further than the training went: latencies inside its
-    range.
+    """Return keys of the contract that may differ because training covered the difference: the
+    latencies, if they are within the range of the training.
     """
     observation = experiment.task.observation
     trained = policy.contract.get("observation", {})
@@ -152,6 +153,6 @@ def _list_allowed(policy: Policy, experiment: Experiment) -> tuple[str, ...]:
 
 
 def unique_names(loaded: list[Loaded]) -> list[str]:
-    """Return a name for each; where two are alike, numbered."""
+    """Return a name for each policy; equal names are numbered."""
     names = [item.name for item in loaded]
     return [name if names.count(name) == 1 else f"{name} {i + 1}" for i, name in enumerate(names)]

@@ -1,12 +1,12 @@
-"""The rope after the release, for drawing: it flies with the ball, and sinks to the ground once the
-ball lies there.
+"""Simulate the rope after the release, for drawing: it flies with the ball and sinks to the ground
+after the landing.
 
-The training simulator's landing is that of a lone ball in closed form, so here the ball is not
-pulled by the rope's 4 g: the joints are equal point masses on rigid links, the last link ends in
-the ball. Positions are kept from the ball, in whose free-falling frame gravity vanishes. The
-reference plant has its own rope in flight; of it only the sinking is drawn here.
+The training simulator computes the landing of a ball without a rope in closed form. Therefore the
+rope's 4 g do not act on the ball here: the joints are equal point masses on rigid links, and the
+last link ends in the ball. Positions are relative to the ball, in whose free-falling frame there is
+no gravity. The reference plant simulates its own rope in flight; for it only the sinking is used.
 
-Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccotti, Berendsen, J.
+Source: Verlet steps with a joint solution for all links (SHAKE; Ryckaert, Ciccotti, Berendsen, J.
 Comput. Phys. 23, 1977)."""
 
 import numpy as np
@@ -16,20 +16,20 @@ from numpy.linalg import norm
 from sim.params import GRAVITY
 
 STEP = 1e-3  # [s]
-# Newton steps for the links; from one step of 1 ms to the next they are off by less than 1 % and
-# converge at once
+# Newton iterations for the links; their lengths change by less than 1 % in a step of 1 ms, so that
+# few suffice
 ITERATIONS = 4
 
 SINKING_STEP = 4e-3  # [s]
-SINKING_DAMPING = 6.0  # damping of the rope on the ground [1/s]; a picture's taste, no measurement
+SINKING_DAMPING = 6.0  # damping of the sinking rope [1/s]; chosen for its looks, not measured
 
 
 class LooseRope:
-    """One rope that hangs on nothing but the ball.
+    """A rope that is attached only to the ball.
 
     Attributes:
-        offset_w: joints from the ball's centre, mount end first [m], shape (L, 3). velocity_w:
-            [m/s], shape (L, 3).
+        offset_w: joints relative to the ball's centre, mount end first [m], shape (L, 3).
+        velocity_w: their velocities relative to the ball [m/s], shape (L, 3).
     """
 
     def __init__(
@@ -39,19 +39,19 @@ class LooseRope:
         ball_w: ndarray,
         ball_vel_w: ndarray,
     ):
-        """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's
-        centre [m], [m/s], shape (3,).
+        """Start from positions [m] and velocities [m/s] of the joints, upper end first, shape
+        (L + 1, 3), and of the ball's centre, shape (3,).
         """
         self.offset_w = np.array(points_w[:-1], dtype=float) - ball_w
         self.velocity_w = np.array(velocity_w[:-1], dtype=float) - ball_vel_w
         ends = np.vstack((self.offset_w, np.zeros(3)))
         self._lengths = norm(np.diff(ends, axis=0), axis=1)
         last = norm(np.asarray(points_w[-1]) - points_w[-2])
-        # where the rope ends on the last link, from the ball
+        # share of the last link between the ball's centre and the rope's lower end
         self._knot = 1.0 - last / self._lengths[-1]
 
     def fly(self, duration: float) -> None:
-        """Fly on with the ball for a time [s]."""
+        """Advance the flight with the ball by a time [s]."""
         count = max(1, round(duration / STEP))
         h = duration / count
         for _ in range(count):
@@ -60,12 +60,12 @@ class LooseRope:
             self.offset_w = moved
 
     def sink(self, duration: float, ground: float) -> None:
-        """Fall and come to rest for a time [s] while the ball lies still, its centre over a ground
-        of this height [m].
+        """Let the rope fall and come to rest for a time [s], while the ball does not move; the
+        ground is at a height [m] relative to the ball's centre.
 
-        From the ball outwards each joint goes to its link's length from the one before (Mueller,
-        Kim, Chentanez, Fast simulation of inextensible hair and fur, 2012): not accurate, but it
-        rests on the ground wherever it starts."""
+        Starting at the ball, each joint is moved to its link's length from the previous one
+        (Mueller, Kim, Chentanez, Fast simulation of inextensible hair and fur, 2012). This is not
+        accurate, but the rope comes to rest on the ground from any state."""
         count = max(1, round(duration / SINKING_STEP))
         h = duration / count
         for _ in range(count):
@@ -78,9 +78,11 @@ class LooseRope:
             self.offset_w = moved
 
     def _restore_links(self, moved: ndarray) -> ndarray:
-        """Put positions back onto the links, along the links' directions before the step."""
+        """Restore the links' lengths by moving joints along the links' directions before the
+        step.
+        """
         before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
-        weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not give way
+        weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not move
         for _ in range(ITERATIONS):
             links = np.diff(np.vstack((moved, np.zeros(3))), axis=0)
             excess = np.sum(links * links, axis=1) - self._lengths**2
@@ -93,16 +95,16 @@ class LooseRope:
         return moved
 
     def points_w(self, ball_w: ndarray) -> ndarray:
-        """Joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``, shape
-        (3,).
+        """Return joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``,
+        shape (3,).
         """
         knot = self._knot * self.offset_w[-1:]
         return np.vstack((self.offset_w, knot)) + ball_w
 
 
 def _place_on_link(joint: ndarray, end: ndarray, length: float, ground: float) -> ndarray:
-    """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's
-    centre [m].
+    """Return a joint moved to the distance ``length`` from the link's other end and above the
+    ground; all positions relative to the ball's centre [m].
     """
     offset = joint - end
     offset *= length / max(float(norm(offset)), 1e-9)

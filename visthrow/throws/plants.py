@@ -1,5 +1,5 @@
-"""The two plants behind one face: the training simulator and the reference plant, NumPy
-in and out.
+"""A common interface for the two plants, the training simulator and the reference plant, with NumPy
+arrays.
 """
 
 import math
@@ -35,19 +35,19 @@ PLANTS = {
         "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
     ),
 }
-"""Name -> what pictures call it, and what titles of tables call it."""
+"""Name -> its description in pictures, and in titles of tables."""
 
 
 def check_plant(name: str) -> str:
-    """Return a name of :data:`PLANTS`; ConfigError for another."""
+    """Return the name if it is in :data:`PLANTS`, or raise ConfigError."""
     if name not in PLANTS:
         raise ConfigError(f"no plant '{name}'; {suggest(name, PLANTS)}")
     return name
 
 
-# state arrays of bodies and ropes
+# state arrays of vehicles and ropes
 BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
-FALL_STEP = 0.02  # largest of RK4 in flight [s]; 1e-8 m off a tennis ball's path after a second
+FALL_STEP = 0.02  # largest RK4 step in flight [s]; error for a tennis ball: 1e-8 m after 1 s
 
 
 class Plant(Protocol):
@@ -59,8 +59,8 @@ class Plant(Protocol):
     time: float
 
     def reset(self, pos_w: ndarray, cable_dir_w: ndarray | None = None) -> None:
-        """Put the vehicles level and at rest to positions [m], shape (E, 3), with stated rope
-        directions (E, L, 3).
+        """Place the vehicles at positions [m], shape (E, 3), level and at rest, with rope
+        directions (E, L, 3); default straight down.
         """
 
     def step(self, command: ndarray, release: ndarray | bool = False) -> None:
@@ -68,32 +68,32 @@ class Plant(Protocol):
 
     @property
     def state(self) -> Snapshot:
-        """The truth."""
+        """Return the true state."""
 
     def measured(self) -> Snapshot:
-        """The measurements for the pilot, with the plant's noise and latency."""
+        """Return the measurements for the pilot, with the plant's noise and latency."""
 
     @property
     def exposed(self) -> Snapshot:
-        """The truth of which :meth:`measured` tells: what a camera sees that is triggered with
-        motion capture.
+        """Return the true state at the time of :meth:`measured`, as a camera that is triggered with
+        motion capture sees it.
         """
 
     @property
     def sample(self) -> Snapshot:
-        """The samples of motion capture and gyro behind the last :meth:`measured`; ``time`` is when
-        it was true.
+        """Return the samples of motion capture and gyro in the last :meth:`measured`; ``time`` is
+        the time at which they were taken.
         """
 
     @property
     def landing(self) -> PayloadLandings:
-        """PayloadLandings so far."""
+        """Return the landings so far."""
 
 
 class HybridPlant:
     """The training simulator.
 
-    After the release the ball flies in closed form and the rope with it (`LooseRope`).
+    After the release the ball's flight is computed by `fly_payloads` and the rope's by `LooseRope`.
     """
 
     name = "hybrid"
@@ -112,14 +112,15 @@ class HybridPlant:
         """Build the simulator of an experiment's plant.
 
         Args:
-            experiment, count, device: see above; E; "cpu" or "cuda:0".
-            seed: of the measurements' noise.
-            noise: of the measurements, in each quantity's SI unit as in training; None for none.
-            latency: range that each vehicle's age of measurements is drawn from at a reset [s].
-            start: with it, vehicles, ropes and starts are those of
+            experiment: experiment with the plant.
+            count: number E of vehicles. device: "cpu" or "cuda:0".
+            seed: seed of the measurements' noise.
+            noise: noise of the measurements, in SI units as in training; None for none.
+            latency: range of each vehicle's age of measurements, drawn at a reset [s].
+            start: if given, vehicles, ropes and initial states are those of
                 :func:`visthrow.training.protocol.throw` with the same seed and start, and commands
                 are disturbed as in training.
-            motors: commands are motor-speed set-points [rad/s], shape (E, 4); see
+            motors: whether commands are motor-speed set-points [rad/s], shape (E, 4); see
                 `sim.hybrid.HybridSim`.
         """
         from sim.hybrid import HybridSim, rope_variants
@@ -138,7 +139,7 @@ class HybridPlant:
         if start is None:
             self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
         else:
-            # as ThrowEnv, which draws once when it is built and once when it is reset
+            # twice, like ThrowEnv, which draws once in its constructor and once in its reset
             self._sim.randomize(start)
             self._sim.randomize(start)
             self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
@@ -151,7 +152,7 @@ class HybridPlant:
     def _begin(self) -> None:
         self.time = 0.0
         count = self.count
-        self._state: Snapshot | None = None  # since the last step; made on demand
+        self._state: Snapshot | None = None  # state after the last step, computed on demand
         self._latched = np.zeros(count, bool)
         self._separation = np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
@@ -186,10 +187,8 @@ class HybridPlant:
         self.time += self.period
 
     def hold(self, names: dict[str, ndarray] | None = None) -> dict[str, ndarray]:
-        """Put bodies and ropes back to where an earlier call found them, or only look; motors and
-        battery go on.
-
-        Takes and returns state arrays of bodies and ropes.
+        """Restore the state of vehicles and ropes that an earlier call returned, or only return
+        it; motors and battery are not affected.
         """
         self._state = None
         for name, value in (names or {}).items():
@@ -199,19 +198,19 @@ class HybridPlant:
         return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
 
     def look(self, *names: str) -> list[ndarray]:
-        """Arrays of the simulator's state, environment first: a snapshot's price is many times
-        that.
+        """Return arrays of the simulator's state, environment first; much cheaper than a
+        snapshot.
         """
         return [self._sim.get(name).astype(float) for name in names]
 
     def stop_motors(self) -> None:
-        """Let the rotors stand still."""
+        """Set the rotors' speeds to zero."""
         self._state = None
         self._sim.state.motor_speed.zero_()
 
     def postpone(self, time: float) -> None:
-        """Let payloads that are latched and still hang separate so much later [s]: the latch
-        tripped within the last period.
+        """Delay by a time [s] the separation of payloads whose latch tripped in the last period and
+        that are still attached.
         """
         timer = self._sim.get("release_timer")
         waits = self._latched & (self._sim.get("attached") != 0) & (timer >= 0.0)
@@ -219,7 +218,7 @@ class HybridPlant:
         self._sim.state.release_timer.assign(later)
 
     def _disturb(self, command: ndarray) -> ndarray:
-        """Commands with the training's noise, which is on their normalised form."""
+        """Return commands with the noise of training, which is added to normalised commands."""
         import torch
 
         from visthrow.onboard import actions as act
@@ -233,8 +232,8 @@ class HybridPlant:
         return act.command_from_action(action, max_thrust, rates).numpy()
 
     def _let_go(self, e: int) -> LooseRope:
-        """Rope of one plant at separation: the simulator keeps its directions and rates of that
-        instant.
+        """Return the rope of one plant at separation; the simulator keeps the directions and rates
+        of this instant.
         """
         rope = self.params.rope
         arrays = self.look("payload_pos_w", "payload_vel_w", "cable_dir_w", "cable_vel_w")
@@ -248,7 +247,7 @@ class HybridPlant:
         return LooseRope(upwards(ball, direction), upwards(ball_vel, turn), ball, ball_vel)
 
     def _ball(self) -> tuple[ndarray, ndarray]:
-        """Ball in flight: position and velocity; at rest after landing."""
+        """Return the balls' positions and velocities, shape (E, 3); at rest after the landing."""
         landing = self.landing
         since = np.nan_to_num(self.time - self._separation)
         start = self.look("payload_pos_w", "payload_vel_w")
@@ -258,7 +257,7 @@ class HybridPlant:
 
     @property
     def state(self) -> Snapshot:
-        """See `Plant`; all calls within a period get the same one."""
+        """Return the true state; all calls within a period return the same object."""
         self._state = self._state or self._snapshot()
         return self._state
 
@@ -286,8 +285,8 @@ class HybridPlant:
         )
 
     def measured(self) -> Snapshot:
-        """Return the truth, late and with the training's observation noise, which on the attitude
-        is an angle [rad].
+        """Return the delayed state with the observation noise of training; for the attitude the
+        noise is a rotation angle [rad].
         """
         if self.noise is not None:
             step = self.noise.observation_step * self._rng.standard_normal((5, self.count, 3))
@@ -300,10 +299,10 @@ class HybridPlant:
 
     @property
     def sample(self) -> Snapshot:
-        """The truth now, with the error of the last :meth:`measured`.
+        """Return the current true state with the error of the last :meth:`measured`.
 
-        The pilot hears of it late, by a chord between two control steps as in training; sensors
-        know no chord."""
+        The pilot receives it with a delay, interpolated between control steps as in training. A
+        real sensor does not interpolate, so a log holds this sample."""
         return self._add_error(self.state)
 
     def _add_error(self, snapshot: Snapshot) -> Snapshot:
@@ -324,14 +323,14 @@ class HybridPlant:
 
 
 class ReferenceAdapter:
-    """The reference plant, with the pinned extras or with none but the latency and drag that the
-    policy was trained for.
+    """The reference plant, with its fixed realistic extras, or with only the latency and payload
+    drag of the policy's training.
     """
 
     def __init__(
         self, experiment: Experiment, count: int = 1, seed: int = 0, realistic: bool = True
     ):
-        """Build the plant; a realistic one has the extras of
+        """Build the plant; ``realistic``: with the extras of
         ``configs/vehicle/reference_realistic.toml``.
         """
         from sim.reference.plant import ReferencePlant
@@ -354,11 +353,11 @@ class ReferenceAdapter:
         self._plant.reset(pos_w, level, zero, zero, cable_dir_w)
 
     def __getattr__(self, name: str) -> Any:
-        """``time``, ``step``, ``state``, ``exposed`` and ``landing`` are the plant's own."""
+        """Return ``time``, ``step``, ``state``, ``exposed`` and ``landing`` of the plant."""
         return getattr(self._plant, name)
 
     def measured(self) -> Snapshot:
-        """Return the newest sample: the plant's latency is that of whole samples."""
+        """Return the newest sample that the plant's latency lets through."""
         self.sample = self._plant.measured()
         return self.sample
 
@@ -366,8 +365,8 @@ class ReferenceAdapter:
 def fly_payloads(
     rope: RopeParams, air: AirParams, pos_w: ndarray, vel_w: ndarray, time: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,),
-    under gravity, wind, air forces.
+    """Return positions [m] and velocities [m/s] of payloads, shape (E, 3), after flights of a time
+    [s], shape (E,), under gravity, wind and aerodynamic forces.
     """
     time = np.asarray(time, dtype=float)[:, None]
     if not (rope.payload_drag or rope.payload_side or rope.payload_lift):
@@ -402,7 +401,7 @@ def fly_payloads(
 def make_plant(
     name: str, experiment: Experiment, count: int = 1, seed: int = 0, device: str = "cpu"
 ) -> Plant:
-    """Build a plant by its name in :data:`PLANTS`; the training simulator with the task's noise and
+    """Build a plant by its name in :data:`PLANTS`; the training simulator has the task's noise and
     latency.
     """
     if check_plant(name) == "hybrid":
@@ -412,8 +411,8 @@ def make_plant(
 
 
 def _late(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
-    """Return measurements, linear between states one control period apart, newest first; age: in
-    periods, shape (E,).
+    """Return states of an age in control periods, shape (E,), interpolated linearly between
+    ``states`` one period apart, newest first.
     """
     newest = states[0]
     if not np.any(age):
@@ -432,8 +431,8 @@ def _late(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
 
 
 def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> ndarray:
-    """Straight ropes off the vertical by a normal angle of deviation ``angle`` [rad], shape (E, L,
-    3).
+    """Return directions of straight ropes, tilted from the vertical by normal angles about two axes
+    with standard deviation ``angle`` [rad], shape (E, L, 3).
     """
     tilt = angle * rng.standard_normal((count, 2))
     down = np.column_stack((tilt, -np.ones(count)))

@@ -1,4 +1,4 @@
-"""Recorded throws: from hover to the vehicle hovering again."""
+"""Fly and record a throw, from a hover to a hover."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,28 +15,28 @@ from visthrow.throws.loading import Loaded
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
 
-START_SPREAD = 0.10  # of the start about the hover point [m]
-START_SWING = 0.05  # of the rope at the start [rad]
-HOVER_LEAST = 1.5  # time in hover before the throw [s]
-HOVER_MOST = 6.0  # likewise [s]
-QUIET_OFFSET = 0.03  # vehicle off its hover point [m]
-QUIET_SPEED = 0.12  # payload against the world [m/s]
-QUIET_TIME = 0.4  # for which it must last [s]
-RECOVERY_MOST = 8.0  # [s]
-# height at which the rope is drawn where it would pass through the ground; no plant knows it [m]
+START_SPREAD = 0.10  # largest offset of the start from the hover point, on each axis [m]
+START_SWING = 0.05  # standard deviation of the rope's angle at the start [rad]
+HOVER_LEAST = 1.5  # shortest hover before the throw [s]
+HOVER_MOST = 6.0  # longest hover before the throw [s]
+QUIET_OFFSET = 0.03  # largest offset from the hover point of a quiet vehicle [m]
+QUIET_SPEED = 0.12  # largest speed of a quiet payload, or of a recovered vehicle [m/s]
+QUIET_TIME = 0.4  # time for which it must be quiet [s]
+RECOVERY_MOST = 8.0  # longest recovery [s]
+# height at which the rope is drawn where it would pass through the ground, which no plant simulates
+# for ropes [m]
 ROPE_ON_GROUND = 0.003
 MEASURED = {"pos_w": "m", "quat_wb": "1", "vel_w": "m/s", "rate_b": "rad/s", "payload_pos_w": "m"}
-"""Channels recorded a second time as measured, under ``measured_<name>``, stamped when they were
-true, with their units.
+"""Channel -> unit of quantities that are also recorded as measured, under ``measured_<name>``, with
+the times of the measurements.
 """
 TRUTH = (*MEASURED, "payload_vel_w", "motor_speed", "battery_voltage", "attached")
-"""Channels of what is true."""
+"""Channels of the true state."""
 
 
 class ThrowRecorder(FlightObserver):
-    """A flight log of one vehicle: the true state at each period's beginning, the command sent
-    then, the rope down to the ground, the camera's keypoints, and the time of the release command,
-    ``latch`` [s].
+    """A recorder of one vehicle's flight log: the true state and the command at the start of each
+    period, the rope, the camera's keypoints, and the time of the release command, ``latch`` [s].
     """
 
     def __init__(self, pilots: Policies, meta: dict[str, Any]):
@@ -69,13 +69,11 @@ class ThrowRecorder(FlightObserver):
         self.sample(flight)
 
     def add_truth(self, state: Snapshot) -> None:
-        """Record what is true."""
+        """Record the true state."""
         self.recorder.add(state.time, **{name: getattr(state, name)[0] for name in TRUTH})
 
     def sample(self, flight: Flight) -> None:
-        """Record the rope now, and the measured state that the pilot was given last, stamped when
-        it was true.
-        """
+        """Record the current rope and the last measurement, with the time of the measurement."""
         points = self._rope(flight)
         points[:, 2] = np.maximum(points[:, 2], ROPE_ON_GROUND)
         self.recorder.add(flight.now.time, cable_points_w=points)
@@ -87,8 +85,8 @@ class ThrowRecorder(FlightObserver):
         self._before = flight.now
 
     def _rope(self, flight: Flight) -> ndarray:
-        """Rope now; after the landing it sinks to the ground instead of standing still as the
-        plants leave it.
+        """Return the current rope [m], shape (L + 1, 3). After the landing it sinks to the ground;
+        the plants stop simulating it.
         """
         state = flight.now
         landing = flight.plant.landing
@@ -116,23 +114,23 @@ def fly(
     device: str = "cpu",
     eyes: Sight | None = None,
 ) -> FlightLog:
-    """Hover until the swing is quiet, throw, and hover again at the start.
+    """Hover until the payload is quiet, throw, and hover at the start again.
 
-    The throw ends at separation; from there the hover controller has the vehicle. Keypoints are
-    those that the pilot computes from measured poses, and are recorded for a state policy too.
-    Raises ConfigError: the goal is not a point in reach of the vehicle's bounds.
+    The policy flies until separation, then the hover controller does. The recorded keypoints are
+    those that the pilot computes from measured poses, also for a state policy. Raises ConfigError:
+    the goal is invalid or outside the vehicle's bounds.
 
     Args:
         loaded: policy and experiment.
-        goal_w: on the ground [m], shape (3,).
-        plant_name: of :data:`visthrow.throws.plants.PLANTS`. seed: of start, plant and
-            measurements. device: of the training simulator.
-        eyes: of one vehicle, whose rendered pictures keypoints come from; recorded are those that
-            the policy was shown.
+        goal_w: goal on the ground [m], shape (3,).
+        plant_name: name in :data:`visthrow.throws.plants.PLANTS`.
+        seed: seed of start, plant and measurements. device: device of the training simulator.
+        eyes: source of keypoints from rendered pictures of one vehicle; if given, these keypoints
+            are recorded.
 
     Returns:
-        The flight with all standard channels; ``meta["result"]`` says how it ended,
-        ``meta["times"]`` when.
+        The flight with all standard channels; ``meta["result"]`` holds the result of the throw,
+        ``meta["times"]`` the times of its events.
     """
     check_goal(loaded, goal_w)
     experiment = loaded.experiment
@@ -163,8 +161,8 @@ def fly(
 
 
 def check_goal(loaded: Loaded, goal_w: ndarray) -> None:
-    """Refuse a goal that is not three finite numbers, or further than the vehicle may fly, with a
-    ConfigError.
+    """Raise ConfigError for a goal that is not three finite numbers or is outside the vehicle's
+    bounds.
     """
     goal_w = np.asarray(goal_w, dtype=float)
     limit = loaded.experiment.task.bounds.horizontal
@@ -193,7 +191,9 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: ndarray, seed: int) -> dict[s
 def _hover_until(
     quiet: Callable[[Snapshot], bool], home: ndarray, shortest: float, longest: float
 ) -> Phase:
-    """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
+    """Return the phase of a hover that ends when the vehicle has been at ``home`` and quiet for
+    :data:`QUIET_TIME`, within a shortest and a longest time [s].
+    """
     calm = 0.0
 
     def is_finished(flight: Flight) -> bool:
@@ -208,7 +208,7 @@ def _hover_until(
 
 
 def _finish(flight: Flight, recording: ThrowRecorder, recovery: float) -> FlightLog:
-    """Return the log with the last state, and how the throw ended."""
+    """Return the log with the last state and the result of the throw."""
     plant = flight.plant
     state = flight.now
     recorder = recording.recorder

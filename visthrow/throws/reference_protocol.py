@@ -1,11 +1,11 @@
-"""The paper's measurement on the reference plant: throws from hover, scored as
-:mod:`visthrow.task.measurement` says.
+"""Make the paper's measurement on the reference plant: throws from hover, scored by
+:mod:`visthrow.task.measurement`.
 
-Each throw hovers first under the hover controller, so that battery, integrals and swing are those
-of a hover, and sees the plant's own measurements. Keypoints come from measured poses, as in the
-paper's hardware-in-the-loop tests. Throws fly in batches of :data:`BATCH`, each with a seed of its
-own made of seed, target and number of the batch: results do not depend on the number of processes,
-and every policy meets the same vehicles, winds and starts."""
+Before each throw the hover controller flies, so that battery, integrals and swing are those of a
+hover. The policy receives the plant's measurements. Keypoints are computed from measured poses, as
+in the paper's hardware-in-the-loop tests. Throws are flown in batches of :data:`BATCH`. The seed of
+a batch follows from seed, target and number of the batch, so results do not depend on the number of
+processes, and every policy flies the same vehicles, winds and initial states."""
 
 import importlib
 import math
@@ -25,11 +25,11 @@ from visthrow.throws.flight_loop import Decision, Flight, Policies, Scores, Sigh
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
 
-BATCH = 100  # throws that share one plant: about 12 s of one core a batch and 1 s a throw
+BATCH = 100  # throws that share one plant; about 12 s of one core for a batch and 1 s for a throw
 
-HOVER_TIME = 1.6  # before the policy takes over [s]; a whole number of control periods
+HOVER_TIME = 1.6  # hover before the policy takes over [s]; a whole number of control periods
 
-THROW_TIME = 1.3  # time of most throws until the landing, for the line of progress [s]
+THROW_TIME = 1.3  # typical time of a throw until the landing, for the progress line [s]
 
 FIELDS = ("success", "landing_w", "error", "duration", "clearance", "smoothness")
 
@@ -38,17 +38,19 @@ FIELDS = ("success", "landing_w", "error", "duration", "clearance", "smoothness"
 class Job:
     """One batch of throws at one target."""
 
-    policies: tuple[int, ...]  # which of the policies share the batch
+    policies: tuple[int, ...]  # indices of the policies that share the batch
     target: float  # [m] along x
     batch: int
-    count: int  # throws of each of them
+    count: int  # throws of each of these policies
     seed: int
 
 
 def batch_plant(
     experiment: Experiment, plant_name: str, target: float, batch: int, count: int, seed: int
 ) -> tuple[Plant, np.random.Generator]:
-    """Plant of one batch, and the generator of its starts: the same for all policies."""
+    """Return the plant of one batch and the random generator of its initial states; they are the
+    same for all policies.
+    """
     seeds = np.random.SeedSequence([seed, round(1000 * target), batch])
     plant_seed = int(seeds.generate_state(1)[0])
     plant = make_plant(plant_name, experiment, count, plant_seed)
@@ -56,9 +58,7 @@ def batch_plant(
 
 
 def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> ndarray:
-    """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m],
-    shape (3,).
-    """
+    """Place the vehicles near the hover point and return that point [m], shape (3,)."""
     start = pilots_hover()
     home = np.array([0.0, 0.0, start.spawn_height])
     spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
@@ -71,11 +71,11 @@ def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generato
 def fly_batch(
     loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: Sight | None = None
 ) -> dict[str, ndarray]:
-    """Fly one batch of policies that are trained for one plant, on the rendered pictures of
-    ``eyes`` where there are any.
+    """Fly one batch of policies that were trained for the same plant; ``eyes``: source of keypoints
+    from rendered pictures.
 
     Returns :data:`FIELDS` of :class:`visthrow.task.measurement.Throws`, the first policy's throws
-    first, and ``goal_w`` where goals move; NaN where a throw failed."""
+    first, and ``goal_w`` if goals move; NaN where a throw failed."""
     flown = [loaded[i] for i in job.policies]
     experiment = flown[0].experiment
     count = job.count * len(flown)
@@ -89,15 +89,15 @@ def fly_batch(
 
 
 class _Scores(Scores):
-    """Tells of the progress too."""
+    """Scores that also report progress."""
 
     def before(self, flight: Flight, snapshot: Snapshot, sent: Decision) -> None:
         progress(min(flight.plant.time / (HOVER_TIME + THROW_TIME), 0.99))
 
 
 def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generator) -> ndarray:
-    """Velocities of the task's goals [m/s], shape (E, 3); nothing is drawn where they
-    stand still.
+    """Return velocities of the task's goals [m/s], shape (E, 3); zero, without random draws, if
+    goals do not move.
     """
     if not experiment.task.target.moves:
         return np.zeros((count, 3))
@@ -107,7 +107,7 @@ def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generato
 
 
 def batches(throws: int, size: int = BATCH) -> list[tuple[int, int]]:
-    """Return the number and size of each batch that throws are cut into."""
+    """Divide throws into batches; return the index and the size of each."""
     return [(first // size, min(size, throws - first)) for first in range(0, throws, size)]
 
 
@@ -119,8 +119,8 @@ def plan(
     together: bool = False,
     size: int = BATCH,
 ) -> list[Job]:
-    """Cut throws of each policy at each target into batches, with all policies in one batch or each
-    in its own.
+    """Divide the throws of each policy at each target into batches; ``together``: all policies
+    share the batches.
     """
     groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
     cut = batches(throws, size)
@@ -130,7 +130,7 @@ def plan(
 
 
 class Throwing(Workers):
-    """Throws that run in separate processes; a context manager that stops them when left early.
+    """Throws in separate processes; a context manager that stops these if it is left early.
 
     >>> plant = "reference-realistic"
     >>> with Throwing(policies, (1.5, 2.0), 200, plant, seed=0) as throwing:  # doctest: +SKIP
@@ -148,18 +148,20 @@ class Throwing(Workers):
         together: bool = False,
         size: int = BATCH,
     ):
-        """Start so many throws of each policy at each target [m] along x.
+        """Start ``throws`` throws of each policy at each target [m] along x.
 
-        Raises ConfigError: policies of different plants that are to fly together;
+        Raises ConfigError: ``together`` is set, but the policies have different plants;
         ModuleNotFoundError: MuJoCo is not installed.
 
         Args:
-            loaded, targets, throws, plant_name, seed: of everything random.
-            processes: default one a core, and no more than there are batches.
-            together: fly all policies in one batch, which is cheaper for a few throws; they must
-                share a plant.
-            size: throws of a policy in a batch; fewer are sooner done where there are more cores.
-                Other sizes, other draws.
+            loaded: policies. targets: distances [m]. plant_name: name of the plant.
+            throws: number of throws of each policy at each target.
+            seed: seed of all random draws.
+            processes: number of processes; default one for each core, at most one for each batch.
+            together: fly all policies in the same batches, which is cheaper for a few throws; they
+                must have the same plant.
+            size: throws of a policy in a batch; smaller batches finish earlier on many cores. The
+                random draws depend on the size.
         """
         importlib.import_module("mujoco")  # a missing package is reported once, not by every worker
         plant = plant_of(loaded[0].experiment)
@@ -172,8 +174,8 @@ class Throwing(Workers):
         super().__init__(flown, self.jobs, processes or cores(), "throws on the reference plant")
 
     def results(self, show: bool = True) -> list[list[Throws]]:
-        """Wait, with a progress line on a terminal; returns for each policy a
-        :class:`visthrow.task.measurement.Throws` a target.
+        """Wait, with a progress line on a terminal; return for each policy one
+        :class:`visthrow.task.measurement.Throws` for each target.
         """
         self.label *= show
         results = dict(self)
@@ -184,7 +186,7 @@ class Throwing(Workers):
         return rows
 
     def _throws(self, parts: Sequence[dict[str, ndarray]], policy: int, target: float) -> Throws:
-        """All throws of one policy at one target."""
+        """Return all throws of one policy at one target."""
         units = []
         for job, part in zip(self.jobs, parts):
             if job.target == target and policy in job.policies:

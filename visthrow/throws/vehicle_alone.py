@@ -1,4 +1,4 @@
-"""A flight of the vehicle alone: no rope, no payload, no policy."""
+"""Fly the vehicle without rope, payload and policy."""
 
 import numpy as np
 
@@ -24,10 +24,10 @@ def fly_alone(
     Args:
         experiment: vehicle, air and numerics of the simulator.
         target: x and y [m], world frame.
-        integrator: of :data:`sim.hybrid.INTEGRATORS`. device: of the simulator.
+        integrator: name in :data:`sim.hybrid.INTEGRATORS`. device: device of the simulator.
 
     Returns:
-        The flight; ``meta["result"]["error"]`` is the distance from the point at its end [m].
+        The flight; ``meta["result"]["error"]`` is the final distance from the point [m].
     """
     vehicle = experiment.vehicle
     sim = HybridSim(plant_of(experiment), 1, device, without_rope=integrator)

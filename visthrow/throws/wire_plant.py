@@ -1,7 +1,6 @@
-"""The training simulator's vehicle for the fake autopilot (`hil.rehearsal.process`), which takes
-its plant from outside.
+"""The training simulator's vehicle as a plant of the fake autopilot (`hil.rehearsal.process`).
 
-``hil`` imports no simulator; it is given ``"visthrow.throws.wire_plant:make"``.
+``hil`` does not import the simulator; it loads ``"visthrow.throws.wire_plant:make"`` by name.
 """
 
 from collections.abc import Sequence
@@ -17,29 +16,28 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
 MECHANISM = 0.06
-"""From the trip of the latch to separation behind a firmware [s]: a quick servo, so that the
-firmware's own delay has room within the lag that the policies were trained with.
+"""Time from the trip of the latch to separation with a real firmware [s]: a quick servo, so that
+this and the firmware's delay together fit the lag with which the policies were trained.
 """
 
-# share of its weight at which a vehicle leaves its stand: a hover commands less than all where it
-# stands too high
+# share of the weight at which the thrust lifts a vehicle off its stand; a hover controller commands
+# less than the weight if the vehicle stands above its set-point
 CARRIED = 0.8
 
 
 class HybridWirePlant:
-    """One vehicle with its payload; NumPy in and out, batch axis left out.
+    """One vehicle with its payload; NumPy arrays without a batch axis.
 
     Attributes:
-        period: of a step [s]: commands that come between two control periods wait no longer than
-            this.
-        home_w: hover point [m]. mass: with and without payload [kg]. max_thrust: that a thrust of 1
-            stands for [N].
+        period: step [s], the longest time that a command waits.
+        home_w: hover point [m]. mass: mass with and without payload [kg]. max_thrust: thrust that a
+            normalised thrust of 1 stands for [N].
     """
 
     period = 0.005
 
     def __init__(self, experiment: Experiment, seed: int):
-        """Put the vehicle near its hover point, the rope swinging a little."""
+        """Place the vehicle near its hover point, with a slightly tilted rope."""
         self._plant = self._build(experiment)
         self.home_w = np.array([0.0, 0.0, experiment.task.start.spawn_height])
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
@@ -52,7 +50,7 @@ class HybridWirePlant:
         return HybridPlant(self._fine(experiment))
 
     def _fine(self, experiment: Experiment) -> Experiment:
-        """Return the experiment with this plant's period, nothing measured late."""
+        """Return the experiment with this plant's period and without latency."""
         observation = "task.observation"
         values = {f"{observation}.latency": (0.0, 0.0), f"{observation}.latency_jitter": 0.0}
         return changed(experiment, values | {"sim.control_period": self.period})
@@ -60,8 +58,8 @@ class HybridWirePlant:
     def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
 
-        ``release``: whether the latch trips in this period, so long after its beginning [s], or has
-        before."""
+        ``release``: whether the latch trips in this period or has tripped before. ``after``: time
+        from the start of the period to the trip [s]."""
         first = release and not self._plant.state.latched[0]
         self._plant.step(np.asarray(command)[None], np.array([release]))
         if first and after > 0.0:
@@ -69,19 +67,19 @@ class HybridWirePlant:
 
     @property
     def time(self) -> float:
-        """Since the start [s]."""
+        """Return the time since the start [s]."""
         return self._plant.time
 
     @property
     def state(self) -> dict[str, ndarray]:
-        """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached: the truth."""
+        """Return the true pos_w, quat_wb, vel_w, rate_b, payload_pos_w and attached."""
         state = self._plant.state
         names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "attached")
         return {name: getattr(state, name)[0] for name in names}
 
     @property
     def landing(self) -> dict[str, list[float] | float | None]:
-        """The payload's landing and separation, None before them."""
+        """Return the payload's landing and separation, None before they happen."""
         landing = self._plant.landing
         report: dict[str, list[float] | float | None]
         report = dict.fromkeys(("landing_w", "landing_time", "separation_time"))
@@ -94,7 +92,7 @@ class HybridWirePlant:
 
 
 def make(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridWirePlant:
-    """Return the plant that a policy, a shipped name or a file, was trained on, with ``key=value``
+    """Build the plant that a policy (a shipped name or a file) was trained on, with ``key=value``
     changes of its configuration.
     """
     return HybridWirePlant(load_policy(policy, None, changes).experiment, seed)
@@ -103,16 +101,16 @@ def make(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridWirePlant
 class HybridMotorPlant(HybridWirePlant):
     """A vehicle without its rate controller, for a firmware that outputs motor commands.
 
-    Electronic speed controllers turn the rotors at ``full_speed * command * voltage / reference``:
-    thrust goes with the square of the command and of the battery's voltage. The reference is the
-    voltage that the controller's full thrust holds at. The vehicle stands still at its start, the
-    rope hanging, until its rotors nearly carry its weight; where it comes down to the ground it
-    stands again, level.
+    The electronic speed controllers set rotor speeds of
+    ``full_speed * command * voltage / reference``, so thrust is proportional to the squares of
+    command and battery voltage. At the reference voltage the full command yields the controller's
+    full thrust. At first the vehicle rests on a stand, with the rope hanging, until its rotors
+    nearly carry its weight. After a touchdown it stands level on the ground.
 
     Attributes:
-        force_b: specific force, what an accelerometer shows [m/s^2], body frame. held: whether it
-            stands. touchdown: speed at which it first met the ground [m/s]; None before.
-        quat_wb, rate_b: attitude xyzw and body rates [rad/s] now.
+        force_b: specific force, as an accelerometer measures it [m/s^2], body frame. held: whether
+            the vehicle stands. touchdown: speed of the first touchdown [m/s]; None before.
+        quat_wb, rate_b: current attitude xyzw and body rates [rad/s].
     """
 
     period = 0.002
@@ -135,15 +133,15 @@ class HybridMotorPlant(HybridWirePlant):
         self.touchdown: float | None = None
 
     def look(self) -> dict[str, ndarray]:
-        """Place, attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the
-        charge now.
+        """Return the current position, attitude, velocity, body rates, motor speeds [rad/s],
+        voltage [V] and used share of the charge.
         """
         names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
     def rope(self) -> list[ndarray]:
-        """Directions of the rope's segments and their derivatives [1/s], shapes (L, 3), world
-        frame.
+        """Return directions of the rope's segments and their derivatives [1/s], shapes (L, 3),
+        world frame.
         """
         return [value[0] for value in self._plant.look("cable_dir_w", "cable_vel_w")]
 
@@ -153,18 +151,18 @@ class HybridMotorPlant(HybridWirePlant):
         self.rate_b = self._now["rate_b"]
 
     def _build(self, experiment: Experiment) -> HybridPlant:
-        # the firmware's own path comes in the delay's place
+        # the firmware's delay replaces the simulated ones
         values = {"vehicle.queue.delay": 0.0, "release.lag": MECHANISM}
         return HybridPlant(self._fine(changed(experiment, values)), motors=True)
 
     @property
     def held(self) -> bool:
-        """Whether it stands."""
+        """Return whether the vehicle stands."""
         return self._stand is not None
 
     @property
     def state(self) -> dict[str, ndarray]:
-        """Return the state as `HybridWirePlant` does; a hanging ball stays above the ground."""
+        """Return the true state; a hanging ball is kept above the ground."""
         state = super().state
         ball = state["payload_pos_w"].copy()
         ball[2] = max(ball[2], self._floor)
@@ -192,16 +190,16 @@ class HybridMotorPlant(HybridWirePlant):
 
     @property
     def voltage(self) -> float:
-        """Voltage of the battery under load [V]."""
+        """Return the battery's voltage under load [V]."""
         return float(self._now["voltage"])
 
     @property
     def weight(self) -> float:
-        """Weight of what flies now [N]."""
+        """Return the weight of the vehicle with its payload, if attached [N]."""
         return self.mass[0 if self._plant.state.attached[0] else 1] * GRAVITY
 
     def _set_down(self) -> None:
-        """Put the vehicle on the ground, at rest and level, the rope straight."""
+        """Place the vehicle on the ground, at rest and level, with a straight rope."""
         if self.touchdown is None:
             self.touchdown = -float(self._now["vel_w"][2])
         _, _, z, w = self.quat_wb
@@ -219,5 +217,5 @@ class HybridMotorPlant(HybridWirePlant):
 
 
 def make_motors(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridMotorPlant:
-    """Make the plant as :func:`make`, flown by motor commands."""
+    """Build the plant of :func:`make` with motor commands."""
     return HybridMotorPlant(load_policy(policy, None, changes).experiment, seed)
