@@ -1,1 +1,1 @@
-"""The policy and what flies with it on board: observation, action, pilot, hover controller."""
+"""The software on board: observation, policy, action, pilot and hover controller."""

@@ -1,18 +1,19 @@
-"""Hover calibration: the camera's tilt, scale and latency and the thrust, from seconds of hover
-that end in a small sway. Onboard-safe.
+"""Hover calibration: estimate the camera's rotation, scale and latency and the thrust from a few
+seconds of hover that end in a small sway. Onboard-safe.
 
-A hanging ball shows where down is; a sway turns the camera against it. One least-squares problem
-holds it all: the vehicle's path, its attitude and the swing as unknowns at every step, tied by the
-momentum of both bodies, the pendulum and the gyro, and what calibration asks for as constants: the
-maximum a posteriori, as a Kalman smoother would find it, with the constants' covariance. What a run
-cannot tell (a lens out of place, biases of motion capture and keypoints) are constants too, each
-with its own spread, so that the answer's uncertainty has them in it.
+The hanging ball shows the vertical, and the sway rotates the camera relative to it. A single
+least-squares problem is solved. Its unknowns at each step are the vehicle's position, velocity and
+attitude and the swing; momentum of both bodies, the pendulum and the gyro relate them. Its constant
+unknowns are the parameters to calibrate. The solution is the maximum a posteriori, as of a Kalman
+smoother, with the constants' covariance. Errors that a run does not determine (a shifted lens,
+biases of motion capture and keypoints) are constants with priors too, so that the covariance
+includes them.
 
 Source: Gauss-Newton on a Markov chain, Bell, "The iterated Kalman smoother as a Gauss-Newton
 method", SIAM J. Optim. 4(3), 1994.
-Convention: the latency is the keypoints' age beyond that of the poses that come with them. The
-camera's turn is a rotation vector in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as in
-`camera.keypoints.KeypointCamera.extrinsics`."""
+Convention: the latency is the keypoints' age minus the age of the poses that come with them. The
+camera's rotation is a rotation vector in the body frame, ``rot_bc = exp(turn) rot_bc_nominal``, as
+in `camera.keypoints.KeypointCamera.extrinsics`."""
 
 import math
 from dataclasses import dataclass
@@ -39,8 +40,8 @@ from visthrow.config.bounds import Bounded, Positive, Vector
 from visthrow.onboard.observations import rotation_from_quat
 
 STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
-"""Unknowns of each step: vehicle [m, m/s], attitude from the measured one [rad], horizontal part of
-the rope's direction and its rate.
+"""Unknowns of each step: vehicle [m, m/s], rotation from the measured attitude [rad], horizontal
+components of the rope's direction and their rates.
 """
 
 CONSTANTS = {
@@ -58,49 +59,48 @@ CONSTANTS = {
     "lens": 3,
     "goal": 2,
 }
-"""Unknowns that stay the same; see `Spreads`."""
+"""Constant unknown -> number of its components; see `Spreads`."""
 
-LEAST_STEPS = 75  # of a calibration
-LEAST_VISIBLE = 0.5  # share of the steps in which the ball is detected
-ROUNDS = 12  # of Gauss-Newton at most
-SETTLED = 1e-3  # step of a constant in its spreads below which it has settled
-OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
+LEAST_STEPS = 75  # lowest number of steps for a calibration
+LEAST_VISIBLE = 0.5  # lowest share of the steps in which the ball is detected
+ROUNDS = 12  # largest number of Gauss-Newton iterations
+SETTLED = 1e-3  # convergence: largest change of a constant, in prior standard deviations
+OUTLIER = 3.0  # standard deviations above which a detection is down-weighted (Huber)
 
 
 @dataclass(frozen=True)
 class Spreads(Bounded):
-    """Standard deviations.
-
-    Of what is measured, each axis and step; of constants that are not asked for; of the model.
+    """Standard deviations of measurements, for each axis and step, of constants and of the model's
+    errors.
     """
 
     pos: Positive = 0.01  # [m]
     vel: Positive = 0.01  # [m/s]
     attitude: Positive = 0.01  # [rad]
-    # of attitude about the body's z over that about x and y, bias too [-]: two columns of the
-    # rotation tell it
+    # ratio of the attitude's error about body z to that about x and y, also for the bias [-]: the
+    # yaw is measured twice, by two columns of the rotation
     heading: Positive = 0.7071
     rate: Positive = 0.01  # [rad/s]
     keypoint: Positive = 0.01  # normalised [-]
-    pose_bias: Positive = 0.001  # of attitude and gyro [rad, rad/s]
-    keypoint_bias: Positive = 0.001  # each keypoint [-]
-    lens: Positive = 0.0003  # place of the lens on the body [m]
-    goal: Positive = 0.001  # place of the goal [m]
-    length: Positive = 0.03  # of the rope, relative [-]
-    drag: Positive = 0.3  # of the rotors, over the mass [1/s]
-    wind: Positive = 0.01  # steady horizontal push [m/s^2]
-    push: Positive = 0.1  # unsteady one on both bodies, each step [m/s^2]
-    lift: Positive = 0.5  # likewise along the body's z, where thrust is late and unsteady
-    pendulum: Positive = 0.05  # of the ball's equation of motion, each step [m/s^2]
-    tilt: Positive = 0.2  # before anything is known [rad]
-    scale: Positive = 0.03  # of the focal length, likewise, relative [-]
-    latency: Positive = 0.05  # likewise [s]
-    thrust: Positive = 0.3  # likewise, relative [-]
+    pose_bias: Positive = 0.001  # bias of attitude and gyro [rad, rad/s]
+    keypoint_bias: Positive = 0.001  # bias of each keypoint [-]
+    lens: Positive = 0.0003  # position of the lens on the body [m]
+    goal: Positive = 0.001  # position of the goal [m]
+    length: Positive = 0.03  # length of the rope, relative [-]
+    drag: Positive = 0.3  # drag of the rotors, over the mass [1/s]
+    wind: Positive = 0.01  # constant horizontal acceleration [m/s^2]
+    push: Positive = 0.1  # random acceleration of both bodies, each step [m/s^2]
+    lift: Positive = 0.5  # the same along body z, where thrust is delayed and varies
+    pendulum: Positive = 0.05  # error of the ball's equation of motion, each step [m/s^2]
+    tilt: Positive = 0.2  # prior of the camera's rotation [rad]
+    scale: Positive = 0.03  # prior of the focal length, relative [-]
+    latency: Positive = 0.05  # prior of the latency [s]
+    thrust: Positive = 0.3  # prior of the thrust, relative [-]
 
 
 @dataclass(frozen=True)
 class Hovered:
-    """The measurements of a hover, a row for each step, on one clock."""
+    """The measurements of a hover, one row for each step, on one clock."""
 
     time: ndarray  # [s], shape (N,)
     pos_w: ndarray  # [m], shape (N, 3)
@@ -111,40 +111,40 @@ class Hovered:
     keypoints: ndarray  # normalised [-], shape (N, 8, 2)
     valid: ndarray  # shape (N, 8), bool
     goal_w: ndarray  # [m], shape (3,)
-    # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
+    # stated age of the keypoints minus that of the poses [s], shape (N,); None: 0
     age: ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The estimates from a hover, each with its standard deviation."""
+    """The estimates from a hover with their standard deviations."""
 
-    # of the camera from its nominal pose: roll, pitch, yaw [rad]
+    # rotation of the camera from its nominal pose: roll, pitch, yaw [rad]
     turn_b: Vector
     turn_sigma: Vector  # [rad]
-    latency: float  # of the keypoints beyond the poses' and beyond what is stated [s]
+    latency: float  # age of the keypoints minus that of the poses and the stated age [s]
     latency_sigma: float  # [s]
-    thrust: float  # that acts, over what is commanded [-]
+    thrust: float  # ratio of actual to commanded thrust [-]
     thrust_sigma: float  # [-]
-    misfit: float  # RMS of the sightings over their spread [-]
+    misfit: float  # RMS of the detections' residuals, in standard deviations [-]
     steps: int
-    scale: float = 0.0  # of the focal length over the nominal one, less 1 [-]
+    scale: float = 0.0  # ratio of the focal length to the nominal one, minus 1 [-]
     scale_sigma: float = 0.0  # [-]
 
     def values(self) -> dict[str, Any]:
-        """Return the estimates for JSON."""
+        """Return the estimates as a dictionary for JSON."""
         return config.to_dict(self)
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Calibration":
-        """Return the inverse of `values`."""
+        """Build a calibration from the dictionary of `values`."""
         fields = {}
         for name, value in values.items():
             fields[name] = tuple(value) if isinstance(value, list) else value
         return cls(**fields)
 
     def __str__(self) -> str:
-        """For the pilot."""
+        """Return a line of text for the pilot."""
         turns = [
             (
                 f"{name} {np.degrees(x):+.2f} +- {np.degrees(sigma):.2f} deg"
@@ -165,7 +165,7 @@ UNKNOWN_YAW = math.radians(2.0)
 
 
 class CalibrationError(VisthrowError):
-    """A hover shows too little to calibrate by."""
+    """A hover whose data do not suffice for a calibration."""
 
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
@@ -175,36 +175,36 @@ SWAY = 1.5  # duration of the sway [s]
 
 SWAY_RATE = 1.0
 SWAY_FREQUENCY = 4.0 / 3.0
-"""Amplitude of roll and pitch rate, 7 deg of tilt about either axis [rad/s]; above the swing's
-frequency: the rope does not follow [Hz].
+"""Amplitude of roll and pitch rate, which yields 7 deg of tilt about either axis [rad/s], and a
+frequency above the swing's, so that the rope does not follow [Hz].
 """
 
 
 def sway(
     since: float, rate: float = SWAY_RATE, frequency: float = SWAY_FREQUENCY
 ) -> tuple[float, float]:
-    """Roll and pitch rate of the sway [rad/s], so long after its begin [s]: once to and fro along a
-    diagonal, then along the other one.
+    """Return roll and pitch rate of the sway [rad/s] at a time since its start [s]: one period
+    along a diagonal, then one along the other.
 
-    A camera's yaw turns the path that the ball takes in the image, latency puts it off along
-    itself. On a circle the two are the same; the sum of their products is the area that a path
-    encloses, and lines enclose none."""
+    An error of the camera's yaw rotates the ball's path in the image; latency shifts the ball along
+    its path. On a circle these effects are the same: their correlation is proportional to the area
+    that a path encloses, which is zero for lines."""
     swung = rate * math.cos(2.0 * math.pi * frequency * since)
     return swung, swung if int(frequency * since + 1e-9) % 2 == 0 else -swung
 
 
 class CalibrationProblem:
-    """Residuals of a hover, over their spreads; all arguments carry a batch axis B in front, for
-    differences.
+    """Residuals of a hover in standard deviations; all arguments have a leading batch axis B, for
+    finite differences.
     """
 
     def __init__(
         self, hovered: Hovered, camera: KeypointCamera, contract: dict[str, Any], spreads: Spreads
     ):
-        """Take the measurements, the nominal camera, float64, and of the policy's contract masses
-        and rope.
+        """Prepare the problem from the measurements, the nominal camera, float64, and the masses
+        and the rope in the policy's contract.
 
-        Raises CalibrationError: too few steps, or too few that show the ball.
+        Raises CalibrationError: too few steps, or too few with a detected ball.
         """
         count = len(hovered.time)
         visible = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
@@ -228,7 +228,7 @@ class CalibrationProblem:
             + rope["payload_inertia"]
             + rope["rope_mass"] * rope["length"] ** 2 / 3.0
         )
-        self.swung = inertia / moment  # to the centre of oscillation [m]
+        self.swung = inertia / moment  # distance to the centre of oscillation [m]
         self.time = tensor(hovered.time)
         self.goal = tensor(hovered.goal_w)
         self.dt = self.time.diff()
@@ -245,7 +245,7 @@ class CalibrationProblem:
         self._set_priors()
 
     def _set_priors(self) -> None:
-        """Set the deviations of constants, pushes and attitudes from the spreads."""
+        """Set the standard deviations of constants, accelerations and attitudes."""
         s = self.spreads
         make = {"dtype": torch.float64}
         named = {"camera": "tilt", "attitude": "pose_bias", "gyro": "pose_bias"}
@@ -261,19 +261,19 @@ class CalibrationProblem:
             parts[name] *= 0.5
 
     def start(self) -> tuple[Tensor, Tensor]:
-        """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants,
-        shape (C,).
+        """Return initial unknowns, the measurements and a rope at rest, shape (N, 13), and
+        constants, shape (C,).
         """
         zeros = self.pos.new_zeros(len(self.time), 7)
         return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros_like(self.prior)
 
     def split(self, constants: Tensor) -> dict[str, Tensor]:
-        """Constants by name, each (B, n)."""
+        """Return the constants by name, each of shape (B, n)."""
         return dict(zip(CONSTANTS, constants.split(list(CONSTANTS.values()), -1)))
 
     def steps(self, x: Tensor, constants: Tensor) -> Tensor:
-        """Residuals of steps k to k + 1 and of what was measured at k, (B, N - 1, 20), of unknowns,
-        (B, N, 13), and constants, (B, C).
+        """Return the residuals of the dynamics from step k to k + 1 and of the measurements at k,
+        shape (B, N - 1, 20), for unknowns, shape (B, N, 13), and constants, shape (B, C).
         """
         c = self.split(constants)
         s = self.spreads
@@ -301,7 +301,7 @@ class CalibrationProblem:
         falling = jump(swung) / dt + GRAVITY * up
         direction = mean(rope)
         perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
-        # Magnus: of a rate that is linear in a step
+        # Magnus expansion for a rate that is linear over a step
         coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
         inverse = rot[:, :-1].mT
         turned = _vector(inverse @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
@@ -318,8 +318,8 @@ class CalibrationProblem:
         return torch.cat(off, -1)
 
     def places(self, latency: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the steps j that sightings fall behind, and the share of the way to j + 1, each
-        (N,).
+        """Return the last step j before each detection's time, and the share of the way to j + 1,
+        each of shape (N,).
         """
         time = self.time
         when = (time - self.age - latency).clamp(min=time[0], max=time[-1] - 1e-9)
@@ -327,9 +327,11 @@ class CalibrationProblem:
         return j, (when - time[j]) / self.dt[j]
 
     def sightings(self, x: Tensor, constants: Tensor, j: Tensor) -> Tensor:
-        """Residuals of ball, its size and goal in the image, over their spreads, shape (B, N, 5);
-        zero where not seen. Arguments as of `steps`; j: steps that the sightings fall behind, shape
-        (N,), held while differences are taken.
+        """Return the residuals of the ball's position and size and the goal's position in the
+        image, in standard deviations, shape (B, N, 5); zero where not detected.
+
+        Arguments: see `steps`. ``j``: last steps before the detections, shape (N,), constant during
+        finite differences.
         """
         camera = self.camera
         c = self.split(constants)
@@ -368,8 +370,8 @@ class CalibrationProblem:
 
 
 def _box(points: Tensor) -> Tensor:
-    """Middle and mean half side of boxes by their edges' midpoints, shape (N, 4, 2):
-    shape (N, 3).
+    """Return centre and mean half side, shape (N, 3), of boxes given by their edges' midpoints,
+    shape (N, 4, 2).
     """
     x = points[:, 0, 0]
     top = points[:, 1, 1]
@@ -379,30 +381,30 @@ def _box(points: Tensor) -> Tensor:
 
 
 def _means(values: Tensor) -> Tensor:
-    """Mean over each step between values that are evenly apart, shape (N, 3): by the cubic through
+    """Return the mean over each step between equidistant values, shape (N, 3), by a cubic through
     four of them, at the ends by the chord.
 
-    A chord is short by (frequency dt)^2 / 12 of a swing, 0.2 % of the sway, which would pass for
-    another focal length."""
+    The chord underestimates an oscillation by (frequency dt)^2 / 12, 0.2 % of the sway, which would
+    appear as an error of the focal length."""
     chord = 0.5 * (values[1:] + values[:-1])
     inner = (13.0 * (values[1:-2] + values[2:-1]) - values[:-3] - values[3:]) / 24.0
     return torch.cat([chord[:1], inner, chord[-1:]])
 
 
 def _rotate(rot: Tensor, vector: Tensor) -> Tensor:
-    """Vectors turned by rotations of the same batch."""
+    """Return vectors rotated by rotations of the same batch."""
     return (rot @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _rope(swing: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-    """Direction of a hanging rope and its rate, from their horizontal parts."""
+    """Return the direction of a hanging rope and its rate, from their horizontal components."""
     down = (1.0 - (swing * swing).sum(-1, keepdim=True)).clamp(min=1e-2).sqrt()
     fall = (swing * rate).sum(-1, keepdim=True) / down
     return torch.cat([swing, -down], -1), torch.cat([rate, fall], -1)
 
 
 def _vector(rot: Tensor) -> Tensor:
-    """Rotation vectors of small rotations."""
+    """Return the rotation vectors of small rotations."""
     twice = rot - rot.mT
     skew = 0.5 * torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1)
     sine2 = (skew * skew).sum(-1, keepdim=True)
@@ -410,13 +412,15 @@ def _vector(rot: Tensor) -> Tensor:
 
 
 def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Tensor:
-    """Cubic through values and slopes of steps j and j + 1 at a share u of the way."""
+    """Return the cubic through values and slopes of steps j and j + 1 at a share u of the way."""
     chord = value[:, j + 1] - value[:, j]
     return value[:, j] + _hermite(chord, slope, j, u, dt)
 
 
 def _hermite(chord: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Tensor:
-    """Rise of a cubic from step j to a share u of its chord to j + 1, by the slopes of both."""
+    """Return the increment from step j to a share u of the way to j + 1 of the cubic with this
+    chord and the slopes at both steps.
+    """
     bend = (1 - u) * (slope[:, j] * dt - chord) - u * (slope[:, j + 1] * dt - chord)
     return u * chord + u * (1 - u) * bend
 
@@ -427,21 +431,21 @@ def calibrate(
     contract: dict[str, Any],
     spreads: Spreads | None = None,
 ) -> Calibration:
-    """Find the camera's turn and latency and the thrust, with the policy's nominal camera, float64,
-    and contract.
+    """Estimate the camera's rotation, scale and latency and the thrust from a hover.
 
-    Raises CalibrationError: it shows too little, or nothing fits.
+    Raises CalibrationError: the data do not suffice, or the fit does not converge.
 
     Args:
-        hovered: a hover of some 3 s that ends in a sway. camera, contract: see above.
-        spreads: of noise and of what is known; left out, those of the training.
+        hovered: a hover of about 3 s that ends in a sway.
+        camera: the policy's nominal camera, float64. contract: the policy's contract.
+        spreads: standard deviations of noise and priors; default those of the training.
     """
     problem = CalibrationProblem(hovered, camera, contract, spreads or Spreads())
     x, c = problem.start()
     for _ in range(ROUNDS):
         try:
             factor, gradient, misfit = _linearise(problem, x, c)
-        except RuntimeError as error:  # of a factorisation
+        except RuntimeError as error:  # the factorisation failed
             raise CalibrationError(f"{NO_ANSWER}: {error}") from error
         step = torch.cholesky_solve(-gradient[:, None], factor)[:, 0]
         width = x.numel()
@@ -457,7 +461,7 @@ def calibrate(
             f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway,"
             " its ball in view"
         )
-    covariance = torch.cholesky_inverse(factor[width:, width:])  # the constants stand last
+    covariance = torch.cholesky_inverse(factor[width:, width:])  # the constants are last
     sigma = problem.split(covariance.diagonal().sqrt()[None])
     estimates = problem.split(c[None])
     row = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
@@ -478,8 +482,8 @@ def calibrate(
 def try_calibration(
     hovered: Hovered, camera: CameraParams, contract: dict[str, Any], spreads: Spreads | None = None
 ) -> Calibration | str:
-    """Return the calibration of a hover by :func:`calibrate`, or the reason of its failure: a task
-    for another process.
+    """Return the calibration of a hover by :func:`calibrate`, or the reason of its failure; meant
+    for a separate process.
     """
     try:
         return calibrate(hovered, KeypointCamera(camera, dtype=torch.float64), contract, spreads)
@@ -488,11 +492,11 @@ def try_calibration(
 
 
 def _linearise(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tensor, Tensor, float]:
-    """Cholesky factor of the normal equations about unknowns, the gradient there, and the misfit of
-    the sightings.
+    """Return the Cholesky factor of the normal equations at the unknowns, the gradient there, and
+    the RMS residual of the detections.
 
-    A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for
-    all of them."""
+    A residual depends on at most two neighbouring steps, so two perturbations, of the even and of
+    the odd steps, yield a derivative for all steps."""
     count, width = x.shape
     h = 1e-5
     j, _ = problem.places(problem.split(c[None])["latency"][0, 0])

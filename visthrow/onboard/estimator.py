@@ -1,15 +1,16 @@
-"""A recurrent estimate of what a policy looks at, from observations that tell it only in part.
+"""Estimate a state policy's observation by a recurrent network from partial observations.
 
 Onboard-safe.
 
-One step takes an observation o and the memory h of the steps before:
+One step takes an observation o and the memory h of the earlier steps:
 
     x = elu(W o' + b), o' normalised             encoder, of one layer or more
     h = GRU(x, h)                                Cho et al., EMNLP 2014, as in torch.nn.GRUCell
-    s = o[kept] + C h + c                        estimate; 0 in place of o where nothing is kept
+    s = o[kept] + C h + c                        estimate; 0 instead of o where nothing is kept
 
-so that what is measured directly passes, corrected, and what is not (a goal behind a turned lens, a
-pose of now rather than of 30 ms ago) is inferred from all that was seen."""
+Entries that are measured directly are thus passed on with a correction. Others (a goal seen by a
+rotated camera, the current pose instead of that of 30 ms ago) are inferred from all measurements so
+far."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -24,13 +25,13 @@ from visthrow.common.errors import PolicyError, suggest
 
 @dataclass(frozen=True)
 class Estimator:
-    """Weights of the estimate, with D the observation's numbers, N the encoder's, H the memory's
-    and S the estimate's; raises `PolicyError` for shapes that do not fit each other, or a number
-    that is not finite.
+    """Weights of the estimator, for D entries of the observation, N of the encoder, H of the memory
+    and S of the estimate. Raises `PolicyError`: inconsistent shapes, or a number that is not
+    finite.
     """
 
-    mean: Tensor  # (D,), of the observation
-    std: Tensor  # (D,), what the observation is divided by
+    mean: Tensor  # (D,), subtracted from the observation
+    std: Tensor  # (D,), divisor of the observation
     encoder_weight: Tensor  # (N, D)
     encoder_bias: Tensor  # (N,)
     input_weight: Tensor  # (3 H, N), reset, update and candidate gate
@@ -40,8 +41,8 @@ class Estimator:
     output_weight: Tensor  # (S, H)
     output_bias: Tensor  # (S,)
     kept: Tensor  # (S,), entry of the observation that each estimate corrects, D for none; int64
-    # weights (N', N) and biases (N',) of the encoder's further layers, the last of which the memory
-    # takes
+    # weights (N', N) and biases (N',) of the encoder's further layers; the last one's output is the
+    # memory's input
     inner: tuple[tuple[Tensor, Tensor], ...] = ()
 
     def __post_init__(self) -> None:
@@ -81,7 +82,7 @@ class Estimator:
             )
 
     def parts(self) -> dict[str, Tensor]:
-        """Return all tensors by name, those of further layers as ``inner0_weight`` and so on."""
+        """Return all tensors by name; those of further layers are ``inner0_weight`` and so on."""
         named = {field.name: getattr(self, field.name) for field in fields(self)[:-1]}
         for i, (weight, bias) in enumerate(self.inner):
             named |= {f"inner{i}_weight": weight, f"inner{i}_bias": bias}
@@ -89,7 +90,7 @@ class Estimator:
 
     @classmethod
     def from_parts(cls, parts: Mapping[str, Tensor]) -> "Estimator":
-        """Build from what :meth:`parts` gave. Raises PolicyError: one is missing."""
+        """Build an estimator from :meth:`parts`. Raises PolicyError: one is missing."""
         names = [field.name for field in fields(cls)[:-1]]
         count = sum(name.startswith("inner") and name.endswith("_weight") for name in parts)
         pairs = [(f"inner{i}_weight", f"inner{i}_bias") for i in range(count)]
@@ -101,17 +102,17 @@ class Estimator:
 
     @property
     def obs_dim(self) -> int:
-        """Width of the observation D."""
+        """Return the width D of the observation."""
         return self.encoder_weight.shape[1]
 
     @property
     def memory(self) -> int:
-        """Width of the memory H."""
+        """Return the width H of the memory."""
         return self.output_weight.shape[1]
 
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Estimate, shape (E, S), and new memory, shape (E, H), from an observation, shape (E, D),
-        and the memory.
+        """Return the estimate, shape (E, S), and the new memory, shape (E, H), for an observation,
+        shape (E, D), and the memory.
         """
         x = F.elu(F.linear((obs - self.mean) / self.std, self.encoder_weight, self.encoder_bias))
         for weight, bias in self.inner:

@@ -1,22 +1,22 @@
-"""Fit of the goal's place, and of its velocity where it moves, from what the actor measures anyway.
+"""Fit the goal's position, and its velocity if it moves, from the actor's measurements.
 
 Onboard-safe.
 
-A history of a few goal measurements cannot serve: with the paper's noise (0.01 m a step) the slope
-through four of them, 20 ms apart, is known to 0.2 m/s, which is 0.15 m at the landing. So every
-control step yields one measured goal position in the world, and the actor is given the slope of the
-weighted least-squares line through all of them since the throw began, drawn to zero by a prior that
-matters for the first few steps. The state layout adds up its measured positions; the vision layout
-sends each seen corner's ray to the ground, a corner counting by the accuracy that its distance
-leaves.
+A history of a few goal measurements does not suffice: with the paper's noise (0.01 m in each step)
+four of them, 20 ms apart, determine the velocity to 0.2 m/s, which is 0.15 m at the landing.
+Therefore each control step yields one measured goal position in the world, and the actor observes
+the slope of the weighted least-squares line through all of them since the start of the throw. A
+prior pulls the slope to zero and matters in the first few steps. The state layout sums its measured
+positions. The vision layout intersects the ray of each visible corner with the ground and weights a
+corner by its accuracy at that distance.
 
-Where a layout is ``located`` the actor is given the mean goal of all steps. A vision layout is
-given where keypoints lie by the camera as it is configured: the network need then not learn the
-lens, but what is wrong with it. The goal is the mean of all steps of the throw, each weighted by
-what its distance leaves: noise averages out, and it is known while it is out of view. An invisible
-corner then reads as the fitted goal's projection.
+In a ``located`` layout the actor observes the mean goal of all steps. A vision layout also contains
+the positions of keypoints according to the nominal camera, so that the network need not learn the
+lens but only its errors. The goal is the mean over all steps of the throw, weighted by accuracy:
+noise averages out, and the goal is known while it is out of view. An invisible corner is replaced
+by the projection of the fitted goal.
 
-Source: weighted linear regression with a Gaussian prior on the slope (ridge), in sums that are
+Source: weighted linear regression with a Gaussian prior on the slope (ridge), with sums that are
 carried from step to step."""
 
 from typing import NamedTuple
@@ -29,16 +29,16 @@ from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, goal_corners_w
 from camera.mount import points_c_from_w, rotate
 from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
 
-SUMS = 7  # width of the carried sums: w, w t, w t^2, w x, w y, w t x, w t y
-# deviation of one measured goal position of the state layout [m]: three measurements of 0.01 m each
-# are added up
+SUMS = 7  # number of carried sums: w, w t, w t^2, w x, w y, w t x, w t y
+# standard deviation of a measured goal position in the state layout, the sum of three measurements
+# of 0.01 m each [m]
 POSITION_SIGMA = 0.017
-# deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of
-# 110 degrees
+# standard deviation of a corner's ray from camera and attitude [rad]: 0.01 of a half field of view
+# of 110 degrees
 ANGLE_SIGMA = 0.02
-# prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
+# prior standard deviation of each component of the velocity, for speeds uniform up to 1 m/s [m/s]
 SPEED_SIGMA = 0.4
-GRAZING = 0.1  # sine of the least angle below the horizon at which a ray is followed to the ground
+GRAZING = 0.1  # sine of the smallest angle below the horizon at which a ray is used
 
 
 def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
@@ -49,14 +49,14 @@ def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
 def fit(
     sums: Array, time: Array, goal_xy: Array, weight: Array, fresh: Array
 ) -> tuple[Array, Array]:
-    """Take in one step's goal and give the velocity so far.
+    """Add one step's goal to the sums and return the velocity so far.
 
     Args:
-        sums: of the steps before, shape (E, 7).
-        time: since the throw began [s], shape (E,).
+        sums: sums of the earlier steps, shape (E, 7).
+        time: time since the start of the throw [s], shape (E,).
         goal_xy: measured goal [m], shape (E, 2), world frame.
-        weight: inverse variance of it [1/m^2], shape (E,); 0 where the goal was not visible.
-        fresh: throws that begin here, bool, shape (E,).
+        weight: its inverse variance [1/m^2], shape (E,); 0 if the goal was not visible.
+        fresh: whether a throw begins at this step, bool, shape (E,).
 
     Returns:
         The new sums and the velocity [m/s], shape (E, 2), world frame.
@@ -78,8 +78,8 @@ def fit(
 
 
 def place(sums: Array, time: Array, velocity: Array | None = None) -> Array:
-    """Goal by all steps so far [m], shape (E, 2), world frame, by its velocity where it moves
-    [m/s]; 0 where none has seen it.
+    """Return the goal's present position from all steps so far [m], shape (E, 2), world frame; 0 if
+    it was never visible. ``velocity``: velocity of a moving goal [m/s], shape (E, 2).
     """
     total = sums[:, :1].clip(min=1e-9)
     mean = sums[:, 3:5] / total
@@ -91,10 +91,10 @@ def place(sums: Array, time: Array, velocity: Array | None = None) -> Array:
 def measure_goal(
     layout: Layout, frame: Array, valid: Array | None, camera: KeypointCamera | None
 ) -> tuple[Array, Array]:
-    """Goal in the world as one frame shows it.
+    """Return the goal's position as measured in one frame.
 
     Args:
-        layout: of the frame. frame: shape (E, layout.frame), with its noise.
+        layout: layout of the frame. frame: measurements, shape (E, layout.frame).
         valid: validity of the keypoints, shape (E, 8); vision only. camera: vision only.
 
     Returns:
@@ -114,16 +114,16 @@ def measure_goal(
 
 
 def _corners(layout: Layout, frame: Array) -> Array:
-    """Goal corners of vision frames, normalised [-], shape (E, 4, 2)."""
+    """Return the goal corners of vision frames, normalised [-], shape (E, 4, 2)."""
     return frame[:, VEHICLE : VEHICLE + layout.goal].reshape(-1, GOAL_KEYPOINTS, 2)
 
 
 def rays_w(camera: KeypointCamera, rot_wb: Array, points: Array) -> Array:
-    """Directions in which points of the image lie, shape (E, K, 3), world frame.
+    """Return the rays of image points, unit vectors, shape (E, K, 3), world frame.
 
     Args:
-        camera: of the image. rot_wb: attitude, shape (E, 3, 3). points: normalised [-], shape (E,
-            K, 2).
+        camera: the camera. rot_wb: attitude, shape (E, 3, 3).
+        points: image points, normalised [-], shape (E, K, 2).
     """
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(points))
     return rotate(rot_wb, rotate(camera.rot_cb.T, rays_c))
@@ -132,12 +132,12 @@ def rays_w(camera: KeypointCamera, rot_wb: Array, points: Array) -> Array:
 def goal_by_corner(
     frame: Array, valid: Array, camera: KeypointCamera, rot_wb: Array, rays: Array
 ) -> tuple[Array, Array]:
-    """Goal in the world as each corner of one vision frame shows it.
+    """Return the goal's position according to each corner of a vision frame.
 
     Args:
-        frame, valid, camera: as of :func:`measure_goal`. rot_wb: attitude in the frame, shape (E,
-            3, 3).
-        rays: to the corners, shape (E, 4, 3), world frame.
+        frame, valid, camera: see :func:`measure_goal`.
+        rot_wb: attitude in the frame, shape (E, 3, 3).
+        rays: rays to the corners, shape (E, 4, 3), world frame.
 
     Returns:
         Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E,
@@ -154,13 +154,13 @@ def goal_by_corner(
 
 
 class GoalEstimate(NamedTuple):
-    """The sums that :func:`update_goal_fit` adds for a frame."""
+    """The result of :func:`update_goal_fit` for a frame."""
 
-    sums: Array
-    velocity: Array  # of the goal [m/s], shape (E, 2), where the layout has it
-    places: Array  # where they lie, shape (E, layout.located), where the layout has it
-    frame: Array  # with invisible corners at their predicted places
-    valid: Array
+    sums: Array  # with this frame, shape (E, 7)
+    velocity: Array  # of the goal [m/s], shape (E, 2); None if the layout does not have it
+    places: Array  # positions, shape (E, layout.located); None if the layout does not have them
+    frame: Array  # with invisible corners at their predicted positions
+    valid: Array  # validity after this prediction
 
 
 def update_goal_fit(
@@ -172,7 +172,7 @@ def update_goal_fit(
     time: Array,
     fresh: Array,
 ) -> GoalEstimate:
-    """Take one frame into the goal's fit; arguments as of :func:`measure_goal` and :func:`fit`."""
+    """Add one frame to the goal's fit; arguments: see :func:`measure_goal` and :func:`fit`."""
     if layout.name == "state" or not layout.located:
         sums, velocity = fit(sums, time, *measure_goal(layout, frame, valid, camera), fresh)
         moves = velocity if layout.motion else None
@@ -193,11 +193,11 @@ def _update_located(
     time: Array,
     fresh: Array,
 ) -> GoalEstimate:
-    """:func:`update_goal_fit` where the layout says where keypoints lie: of four points of goal
-    or box a wrong one is outvoted.
+    """Do :func:`update_goal_fit` for a located vision layout. Medians over the four points of goal
+    and box reject a single wrong one.
 
-    The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the
-    goal is known, 1; world frame. What is not known is 0."""
+    The positions are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether
+    the goal is known, 1; world frame. Unknown ones are 0."""
     xp = library(frame)
     box = frame[:, VEHICLE + layout.goal :].reshape(-1, 4, 2)
     box_valid = valid[:, GOAL_KEYPOINTS:]
@@ -232,13 +232,14 @@ def predict_invisible_corners(
     goal_xy: Array,
     is_known: Array,
 ) -> tuple[Array, Array]:
-    """Return the frame, and its validity, with invisible corners projected from the goal so far.
+    """Return the frame and its validity with invisible corners replaced by projections of the
+    fitted goal.
 
     Args:
-        layout, frame, valid, camera: as of :func:`measure_goal`. rot_wb: attitude in the frame,
-            shape (E, 3, 3).
-        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. is_known: whether one has
-            seen it, bool, shape (E, 1).
+        layout, frame, valid, camera: see :func:`measure_goal`.
+        rot_wb: attitude in the frame, shape (E, 3, 3).
+        goal_xy: fitted goal [m], shape (E, 2), world frame.
+        is_known: whether the goal was visible in a step so far, bool, shape (E, 1).
     """
     xp = library(frame)
     corners_w = goal_corners_w(goal_xy, camera.square_w)
@@ -253,14 +254,14 @@ def predict_invisible_corners(
 
 
 def middle(points: Array, valid: Array) -> Array:
-    """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one
-    is outvoted; 0 where none is.
+    """Return the median of the valid ones, shape (E, 4), among four points, shape (E, 4, 2), which
+    rejects a single wrong one; 0 if none is valid.
     """
     xp = library(points)
     count = valid.sum(-1)[:, None]
     known = xp.where(valid[..., None], points, float("inf"))
     one, two = known[:, :2], known[:, 2:]
-    # of two pairs, each
+    # smaller and larger one of two pairs each
     small = xp.minimum(one, two)
     large = xp.maximum(one, two)
     first = xp.minimum(small[:, 0], small[:, 1])

@@ -1,8 +1,7 @@
 """The hover controller: collective thrust and body rates that hold a position and a heading.
 
-Onboard-safe (numpy only). It serves before a throw, with the payload hanging below, and after the
-release, without it; the policy learns neither. Batched over vehicles; the same code with a batch of
-one on board."""
+Onboard-safe (numpy only). It flies before a throw, with the payload, and after the release, without
+it; the policy does neither. It is batched over vehicles; on board the batch is one."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -20,22 +19,22 @@ from visthrow.common.rotations import matrix_of_quat
 class HoverParams(BoundedFields):
     """Gains and limits, chosen on the full simulator of the paper's vehicle.
 
-    The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) lies
-    above the position loop and is damped by it: the vehicle gives way to the rope's pull. A higher
-    ``attitude_gain`` or ``velocity_gain`` damps it faster but costs margin: from 12 and 3.5 on, 20
-    ms of further delay make the vehicle without payload ring; at 18 it oscillates at the nominal
-    delay. With these the swing halves every 1.4 s.
+    The swing of a 0.33 m rope under this vehicle (5.9 rad/s with the vehicle free to move) is
+    faster than the position loop, which damps it because the vehicle yields to the rope's pull. A
+    higher ``attitude_gain`` or ``velocity_gain`` damps it faster but reduces the stability margin:
+    from 12 and 3.5 on, 20 ms of additional delay make the vehicle without payload ring; at 18 it
+    oscillates at the nominal delay. With the default gains the swing halves every 1.4 s.
 
-    Raises ValueError if a gain or limit is negative, or the thrust limits are not ordered.
+    Raises ValueError: a gain or limit is negative, or the thrust limits are not ordered.
     """
 
-    position_gain: NotNegative = 1.5  # commanded velocity per metre off [1/s]
+    position_gain: NotNegative = 1.5  # commanded velocity per position error [1/s]
     velocity_gain: NotNegative = 3.5  # [1/s]
     integral_gain: NotNegative = 3.0  # [1/s^3]
     integral_limit: NotNegative = 1.5  # of each component [m/s^2]
     integral_radius: NotNegative = 0.3  # distance from the goal within which the integral grows [m]
     max_speed: NotNegative = 1.5  # of the commanded velocity [m/s]
-    max_acceleration: NotNegative = 6.0  # up and down, commanded besides gravity [m/s^2]
+    max_acceleration: NotNegative = 6.0  # vertical, commanded in addition to gravity [m/s^2]
     max_tilt: Annotated[float, Bound(0.0, np.pi / 2, "[)")] = 0.6  # of the commanded thrust [rad]
     attitude_gain: NotNegative = 9.0  # [1/s]
     yaw_gain: NotNegative = 2.0  # [1/s]
@@ -52,10 +51,10 @@ class HoverParams(BoundedFields):
 
 
 class HoverController:
-    """Position controller with an integral, one for each of E vehicles."""
+    """A position controller with an integral for each of E vehicles."""
 
     def __init__(self, params: HoverParams, period: float, count: int = 1):
-        """Start with empty integrals of E vehicles; the period is between two calls [s].
+        """Start with integrals of zero for ``count`` vehicles; ``period``: time between calls [s].
 
         Raises `ValueError`: either is not positive.
         """
@@ -66,9 +65,7 @@ class HoverController:
         self._integral_w = np.zeros((count, 3))
 
     def reset(self, mask: ndarray | None = None) -> None:
-        """Empty the integrals of the vehicles where ``mask`` (E,) is true, of all
-        without a mask.
-        """
+        """Set the integrals to zero for the vehicles in ``mask``, shape (E,); default all."""
         self._integral_w[slice(None) if mask is None else np.asarray(mask, dtype=bool)] = 0.0
 
     def step(
@@ -98,8 +95,8 @@ class HoverController:
         thrust_w = self._acceleration(pos_w, vel_w, goal_w)
         thrust_w[:, 2] += GRAVITY
         thrust_w = _limit_tilt(thrust_w, params.max_tilt)
-        # Projected on where the vehicle's thrust points now: while it still turns, none is spent
-        # sideways.
+        # Projected on the present thrust axis: while the vehicle still rotates, no thrust is added
+        # in a wrong direction.
         thrust = np.asarray(mass) * np.sum(thrust_w * rot_wb[:, :, 2], axis=1)
         rates_b = _rates(rot_wb, thrust_w, np.asarray(yaw, dtype=float), params)
         command = np.empty((len(rates_b), 4))
@@ -114,7 +111,7 @@ class HoverController:
         speed = norm(asked_w, axis=1, keepdims=True)
         fast = speed > params.max_speed
         asked_w *= np.where(fast, params.max_speed / np.maximum(speed, 1e-9), 1.0)
-        # On the way there from far off an integral would only wind up, and overshoot on arrival.
+        # During a long approach an integral would wind up and cause an overshoot.
         close = norm(error_w, axis=1, keepdims=True) < params.integral_radius
         growth_w = np.where(close, params.integral_gain * self.period * error_w, 0.0)
         self._integral_w = np.clip(
@@ -128,28 +125,28 @@ class HoverController:
 
 
 def _limit_tilt(thrust_w: ndarray, max_tilt: float) -> ndarray:
-    """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad]
-    from the vertical.
+    """Reduce the horizontal part of the thrust (E, 3) so that its tilt from the vertical is at most
+    ``max_tilt`` [rad].
     """
-    up = np.maximum(thrust_w[:, 2], 0.1 * GRAVITY)  # falling is no reason to turn over
+    up = np.maximum(thrust_w[:, 2], 0.1 * GRAVITY)  # never fly inverted to descend
     flat = norm(thrust_w[:, :2], axis=1)
     scale = np.minimum(1.0, np.tan(max_tilt) * up / np.maximum(flat, 1e-9))
     return np.column_stack((thrust_w[:, :2] * scale[:, None], up))
 
 
 def _rates(rot_wb: ndarray, thrust_w: ndarray, yaw: ndarray, params: HoverParams) -> ndarray:
-    """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and
-    the heading to yaw.
+    """Return body rates (E, 3) [rad/s] that rotate body z to the thrust's direction by the shortest
+    rotation, and the heading to yaw.
     """
     aim_b = np.einsum("eji,ej->ei", rot_wb, thrust_w / norm(thrust_w, axis=1, keepdims=True))
     sine = norm(aim_b[:, :2], axis=1)
     angle = np.arctan2(sine, aim_b[:, 2])
-    # e_z x aim = (-aim_y, aim_x, 0); upside down exactly, any axis will do.
+    # e_z x aim = (-aim_y, aim_x, 0); exactly inverted, any axis is valid.
     axis = np.where(sine[:, None] > 1e-9, np.column_stack((-aim_b[:, 1], aim_b[:, 0])), (1.0, 0.0))
     divisor = np.where(sine > 1e-9, sine, 1.0)
     tilt_rates = params.attitude_gain * angle[:, None] * axis / divisor[:, None]
     heading = np.arctan2(rot_wb[:, 1, 0], rot_wb[:, 0, 0])
     error = np.angle(np.exp(1j * (yaw - heading)))
-    # A turn about the world's vertical has this much of body z in it; none where the vehicle lies
-    # on its side.
+    # This is body z's share of a rotation about the world's vertical; zero for a vehicle on its
+    # side.
     return np.column_stack((tilt_rates, params.yaw_gain * error * rot_wb[:, 2, 2]))

@@ -1,10 +1,10 @@
-"""The one observation: what the training environment and the HIL runner both show the actor.
+"""The actor's observation, which the training environment and the HIL runner both compute here.
 
 Onboard-safe.
 
-``frame`` puts one control step's measurement into a row; noise, where there is any, is added to
-that row; ``observe`` pushes the payload's part into the history and assembles the actor's input.
-With E the batch (1 on board), the layouts are
+A frame holds one control step's measurements in a row, to which training adds noise. ``observe``
+pushes the payload's part into the history and assembles the actor's input. With E the batch size (1
+on board), the layouts are
 
 ``state`` (35 with a history of 3; the paper, Sec. III-C), world frame, SI units::
 
@@ -17,13 +17,12 @@ With E the batch (1 on board), the layouts are
     | payload keypoints, now and H steps back 8 (1 + H) | attached 1
     | validity of goal and payload keypoints 8
 
-With ``located`` ``vision`` has where the keypoints lie 6 after them, ``state`` the averaged goal 2
-(:mod:`visthrow.onboard.goal_motion`). Either one, where goals move, has the fit of the goal's
-velocity 2 (:mod:`visthrow.onboard.goal_motion`) at its end.
+With ``located``, the positions of goal and payload 6 (``vision``) or the averaged goal 2
+(``state``) follow. If goals move, the fitted velocity of the goal 2 follows in both layouts
+(:mod:`visthrow.onboard.goal_motion`).
 
-A policy for many vehicles has besides what ``response`` earlier steps were like, velocity 3 | body
-rates 3 | previous action 4 each, newest first, and the vehicle's set-up
-(:mod:`visthrow.task.fleet`) at its end.
+For a policy for many vehicles, ``response`` earlier steps follow, each velocity 3 | body rates 3 |
+previous action 4, newest first, and then the vehicle's properties (:mod:`visthrow.task.fleet`).
 
 The rotation is the first two columns of rot_wb (Zhou et al., CVPR 2019), column after column.
 """
@@ -38,16 +37,16 @@ from camera.arrays import Array, library, push
 from camera.keypoints import KEYPOINTS
 
 VEHICLE = 15
-"""Width of the vehicle's own part."""
+"""Width of the vehicle's part."""
 
 RESPONSE = 10
 """Width of one earlier step of a vehicle's response."""
 
 SETUPS = {"none": 0, "given": 4, "exact": 24}
-"""Widths of a vehicle's set-up, by what ``setup`` says."""
+"""Value of ``setup`` -> width of the vehicle's properties."""
 
 LOCATED = {"state": 2, "vision": 6}
-"""Width of where goal and payload keypoints lie (:mod:`visthrow.onboard.goal_motion`)."""
+"""Layout -> width of the positions of goal and payload (:mod:`visthrow.onboard.goal_motion`)."""
 
 
 @dataclass(frozen=True)
@@ -56,29 +55,29 @@ class Layout:
 
     name: str
     goal: int  # width of the goal's part
-    payload: int  # width of the payload's part, once
+    payload: int  # width of the payload's part in one step
     history: int  # H
     validity: int  # width of the validity bits
     motion: int  # width of the goal's velocity
-    located: int = 0  # width of where the keypoints lie
-    response: int = 0  # earlier steps of the vehicle's response
-    setup: int = 0  # width of the vehicle's set-up
+    located: int = 0  # width of the positions of goal and payload
+    response: int = 0  # number of earlier steps of the vehicle's response
+    setup: int = 0  # width of the vehicle's properties
 
     @property
     def fits(self) -> bool:
-        """Whether the goal is fitted over the steps of a throw
+        """Return whether the goal is fitted over the steps of a throw
         (:mod:`visthrow.onboard.goal_motion`).
         """
         return bool(self.motion or self.located)
 
     @property
     def frame(self) -> int:
-        """Width of a frame without the validity bits: what noise is added to."""
+        """Return the width of a frame, without the validity bits."""
         return VEHICLE + self.goal + self.payload
 
     @property
     def groups(self) -> dict[str, int]:
-        """Widths of the parts of the actor's input, in their order."""
+        """Return the widths of the parts of the actor's input, in their order."""
         return {
             "vehicle": VEHICLE,
             "previous action": 5,
@@ -94,11 +93,11 @@ class Layout:
 
     @property
     def dimension(self) -> int:
-        """Width of the actor's input."""
+        """Return the width of the actor's input."""
         return sum(self.groups.values())
 
     def columns(self, *names: str) -> list[int]:
-        """Columns of these groups in the actor's input."""
+        """Return the columns of these groups in the actor's input."""
         widths = list(self.groups.items())
         starts = [sum(width for _, width in widths[:k]) for k in range(len(widths))]
         places: list[int] = []
@@ -109,13 +108,13 @@ class Layout:
 
 
 def layout_of(params: Any) -> Layout:
-    """Layout of :class:`visthrow.task.ObservationParams` (or anything with its fields).
+    """Return the layout of :class:`visthrow.task.ObservationParams` or an object with its fields.
 
     Raises ValueError: an unknown layout or a negative history.
     """
     if params.history < 0:
         raise ValueError(f"observation history {params.history}; expected 0 or more")
-    # contracts hold what differs from the default
+    # a contract may omit fields with default values
     motion = 2 if getattr(params, "goal_velocity", False) else 0
     response = getattr(params, "response", 0)
     setup = SETUPS[getattr(params, "setup", "none")]
@@ -132,24 +131,23 @@ def layout_of(params: Any) -> Layout:
 
 
 def join_arrays(parts: list[Array]) -> Array:
-    """Return arrays side by side."""
+    """Concatenate arrays along the last axis."""
     return library(parts[0]).concatenate(parts, -1)
 
 
 def resample(history: Array, newest: Array, ages: list[float], period: float) -> Array:
-    """Histories as they would be if a step had come each period before now, by straight lines
-    between those that came.
+    """Resample a history to a regular period by linear interpolation.
 
     Args:
         history: measurements of earlier steps, newest first, shape (E, 1 + H, layout.payload).
-        newest: of this step, shape (E, layout.payload).
-        ages: of earlier steps, newest first, ascending [s]; rows of the history beyond them are
-            copies of the oldest.
-        period: [s].
+        newest: measurements of this step, shape (E, layout.payload).
+        ages: ages of the earlier steps, newest first, ascending [s]; further rows of the history
+            are copies of the oldest.
+        period: control period [s].
 
     Returns:
-        Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than
-        all that came is the oldest.
+        Rows with ages of 1, 2, ... periods, shape (E, 1 + H, layout.payload); rows older than all
+        measurements equal the oldest one.
     """
     xp = library(history)
     knots = [0.0, *ages[: history.shape[1]]]
@@ -167,10 +165,10 @@ def resample(history: Array, newest: Array, ages: list[float], period: float) ->
 @lru_cache
 @torch.inference_mode(False)
 def _rotation_terms(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
-    """Which products of quaternion entries make the entries of the matrix, two each, their signs,
-    and what they add to.
+    """Return the indices of the products of quaternion entries that form each entry of the matrix,
+    two each, their signs, and the identity to which they are added.
     """
-    # of xx, xy, xz, xw, yx, ...
+    # indices into xx, xy, xz, xw, yx, ...
     one, two = ([5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5])
     signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
     identity = xp.eye(3, device=device, dtype=dtype).flatten()
@@ -179,17 +177,17 @@ def _rotation_terms(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
 
 
 def rotation_from_quat(quat: Array) -> Array:
-    """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
+    """Return the rotation matrices, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
     chosen, signs, identity = _rotation_terms(library(quat), quat.device, quat.dtype)
-    products = quat[..., None] * (quat + quat)[..., None, :]  # of all pairs at once
+    products = quat[..., None] * (quat + quat)[..., None, :]  # of all pairs
     terms = products.reshape(*quat.shape[:-1], 16)[..., chosen] * signs
     rot_wb = identity + (terms[..., :9] + terms[..., 9:])
     return rot_wb.reshape(*quat.shape[:-1], 3, 3)
 
 
 def rotation_in(frame: Array) -> Array:
-    """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns
-    are not quite a rotation's.
+    """Return the measured attitudes rot_wb, shape (E, 3, 3), of frames, shape (E, F); with noise
+    their columns are not exactly orthonormal.
     """
     x_axis = frame[:, 9:12]
     y_axis = frame[:, 12:15]
@@ -198,21 +196,21 @@ def rotation_in(frame: Array) -> Array:
 
 
 def vehicle_part(pos_w: Array, vel_w: Array, rate_b: Array, rot_wb: Array) -> Array:
-    """Vehicle's part of a frame, shape (E, 15)."""
+    """Return the vehicle's part of a frame, shape (E, 15)."""
     parts = [pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]]
     return join_arrays(parts)
 
 
 def state_part(pos_w: Array, goal_w: Array, payload_w: Array) -> Array:
-    """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape
-    (E, 5).
+    """Return goal and payload of a state frame: horizontal offset goal - payload, and payload -
+    vehicle, shape (E, 5).
     """
     return join_arrays([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w])
 
 
 def answer(frame: Array, previous_action: Array) -> Array:
-    """Return the vehicle's response in one step, shape (E, 10): velocity, body rates, and the
-    action before it.
+    """Return the vehicle's response in one step, shape (E, 10): velocity, body rates and previous
+    action.
     """
     return join_arrays([frame[:, 3:9], previous_action[:, :4]])
 
@@ -230,24 +228,24 @@ def observe(
     answers: Array | None = None,
     setup: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Assemble the actor's input and move the history on.
+    """Assemble the actor's input and update the history.
+
+    Arguments of parts that the layout does not have are None.
 
     Args:
-        layout: of the policy.
-        frame: shape (E, layout.frame): vehicle, goal, payload.
-        valid: validity of the keypoints, shape (E, 8); None where the layout has none.
+        layout: layout of the policy.
+        frame: vehicle, goal and payload, shape (E, layout.frame).
+        valid: validity of the keypoints, shape (E, 8).
         previous_action: clipped, shape (E, 5).
-        attached: 1 while the payload hangs on the vehicle, shape (E,), float.
-        history: measurements now and earlier, newest first, shape (E, 1 + H, layout.payload).
-        fresh: episodes that begin here, bool, shape (E,): their history is filled with the current
-            value.
-        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2); None where the layout
-            has none.
-        places: where goal and keypoints lie, shape (E, layout.located); None where the layout has
-            none.
-        answers: earlier steps, newest first, shape (E, R, 10): of :func:`answer`; None where the
-            layout has none.
-        setup: of the vehicle, shape (E, layout.setup); None where the layout has none.
+        attached: 1 while the payload is attached to the vehicle, shape (E,), float.
+        history: payload measurements up to the previous step, newest first, shape
+            (E, 1 + H, layout.payload).
+        fresh: whether an episode begins at this step, bool, shape (E,); its history is then filled
+            with the current value.
+        goal_vel_w: fit of the goal's horizontal velocity [m/s], shape (E, 2).
+        places: positions of goal and payload, shape (E, layout.located).
+        answers: responses of earlier steps by :func:`answer`, newest first, shape (E, R, 10).
+        setup: properties of the vehicle, shape (E, layout.setup).
 
     Returns:
         Observation, shape (E, layout.dimension), and the new history.

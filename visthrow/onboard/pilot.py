@@ -1,8 +1,8 @@
-"""The policy in flight: from poses of vehicle, payload and goal to a command. Onboard-safe.
+"""Fly a policy: compute commands from poses of vehicle, payload and goal. Onboard-safe.
 
-The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.onboard.actions` that
-the training environment calls, with a batch of one on board; only the noise is missing. For one
-vehicle all is computed on NumPy arrays, for more on tensors."""
+The pilot calls the same functions of :mod:`visthrow.onboard.observations` and
+:mod:`visthrow.onboard.actions` as the training environment, without noise. It computes on NumPy
+arrays for one vehicle, and on tensors for several."""
 
 import time
 from collections.abc import Collection
@@ -37,14 +37,14 @@ VIEWS = {
     "goal_w": 3,
     "attached": 1,
 }
-"""What one step is shown, and the width of each."""
+"""Measurement of a step -> width."""
 
 SHARED = ("goal_w", "attached")
-"""Of these one may serve all."""
+"""Measurements that may have one row for all vehicles."""
 
 JITTER = 2e-3
-"""By which steps may be off their times without being counted as late [s]: the payload moves some
-millimetres in it.
+"""Largest timing error of a step that does not count as late [s]; the payload moves a few
+millimetres in this time.
 """
 
 
@@ -54,7 +54,7 @@ class PilotOutput:
 
     action: ndarray  # normalised, clipped, shape (E, 5)
     command: ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
-    release: ndarray  # whether the latch is to trip, shape (E,), bool
+    release: ndarray  # whether to trip the latch, shape (E,), bool
     observation: ndarray  # shape (E, D)
     # normalised image coordinates, shape (E, 8, 2); None without a camera
     keypoints: ndarray | None
@@ -62,18 +62,18 @@ class PilotOutput:
 
 
 class PolicyInput(NamedTuple):
-    """The observation of one control step, and what is remembered of it."""
+    """The observation of one control step, and the state for the next one."""
 
     observation: Array  # shape (E, D)
     history: Array  # with this step in it, newest first
-    answers: Array  # the vehicle's response likewise
-    goal_fit: Array  # sums, where the layout fits the goal
-    points: Array  # keypoints, None without a camera
+    answers: Array  # the vehicle's responses with this step in it, newest first
+    goal_fit: Array  # sums, if the layout fits the goal
+    points: Array  # keypoints; None without a camera
     valid: Array
 
 
 def camera_conditions(params: CameraParams) -> dict[str, Any]:
-    """Return what a vision policy's contract says of the camera: lens, mount and sizes, without
+    """Return the camera's entry in a vision policy's contract: lens, mount and sizes, without
     noise.
     """
     camera = config.to_dict(params)
@@ -83,22 +83,22 @@ def camera_conditions(params: CameraParams) -> dict[str, Any]:
 
 
 def with_policy_rule(policy: Policy, params: CameraParams) -> CameraParams:
-    """Return a camera with the policy's own rule for what is out of view: it is the program's, not
-    the camera's.
+    """Return the camera with the policy's rule for keypoints out of view, which belongs to the
+    program and not to the camera.
     """
     rule = policy.contract.get("camera", {}).get("invalid_reads", params.noise.invalid_reads)
     return replace(params, noise=replace(params.noise, invalid_reads=rule))
 
 
 class Pilot:
-    """Flies E vehicles with one policy; remembers the previous action, the history and the policy's
-    memory.
+    """A pilot of E vehicles with one policy, which stores the previous action, the history and the
+    policy's memory.
 
     Attributes:
-        policy: the policy. layout: of its observation. period: between two calls [s].
-        lag: from latch to separation [s].
-        camera: None where the policy looks at none and no camera was given.
-        spent: time that the last call took for the observation and for the policy [s].
+        policy: the policy. layout: layout of its observation. period: time between calls [s].
+        lag: time from latch to separation [s].
+        camera: the camera; None if the policy needs none and none was given.
+        spent: durations of the observation and of the policy in the last call [s].
     """
 
     def __init__(
@@ -108,17 +108,17 @@ class Pilot:
         count: int = 1,
         allow: Collection[str] = (),
     ):
-        """Read the conditions of the policy's contract.
+        """Prepare a pilot from the conditions in the policy's contract.
 
-        Raises PolicyError: the contract lacks an entry, or a vision policy is given no camera;
-        MismatchError: the camera is not the one that the policy was trained with; ValueError: count
-        below 1.
+        Raises PolicyError: an entry of the contract or a vision policy's camera is missing;
+        MismatchError: the camera differs from that of the training; ValueError: count below 1.
 
         Args:
-            policy: on the CPU.
-            camera_params: a vision policy's camera; with a state policy keypoints are computed for
-                drawing.
-            count: E. allow: parts of the camera that may differ, as of :meth:`Policy.require`.
+            policy: policy on the CPU.
+            camera_params: a vision policy's camera; with a state policy keypoints are computed only
+                for drawing.
+            count: number E of vehicles.
+            allow: parts of the camera that may differ; see :meth:`Policy.require`.
         """
         if count < 1:
             raise ValueError(f"pilot of {count} vehicles; expected 1 or more")
@@ -161,7 +161,7 @@ class Pilot:
         self.start()
 
     def start(self) -> None:
-        """Begin a throw from hover: the next call fills the history."""
+        """Start a throw from hover; the next call fills the history."""
         count = self.count
         layout = self.layout
         self._previous = self._first.repeat(count, 0)
@@ -169,17 +169,19 @@ class Pilot:
         self._answers = self._zeros(count, 1 + layout.response, ob.RESPONSE)
         self._goal_fit = self._zeros(count, goal_motion.SUMS)
         self._memory = self._native(self.policy.begin(count).numpy())
-        self._shown: tuple[Any, ...] = ()  # to the last call
+        self._shown: tuple[Any, ...] = ()  # inputs of the last call
         self._fresh = self._zeros(count) == 0.0
         self._steps = 0
-        # of the rows of history and response, newest first; rows beyond copy the oldest [s]
+        # times of the rows of history and response, newest first; further rows copy the oldest [s]
         self._times: tuple[float, ...] = ()
-        # release command of the action before the last one
+        # release output of the action before the last one
         self._unasked = self._previous[:, 4]
 
     @property
     def previous_action(self) -> ndarray:
-        """Clipped action of the last call, hover before the first one, shape (E, 5)."""
+        """Return the clipped action of the last call, or that of hover before the first call, shape
+        (E, 5).
+        """
         return self._previous
 
     @torch.inference_mode()
@@ -195,19 +197,19 @@ class Pilot:
         keypoints: tuple[ndarray, ndarray] | None = None,
         now: float | None = None,
     ) -> PilotOutput:
-        """Decide one control step. Raises ValueError: an array of another shape.
+        """Return the command for one control step. Raises ValueError: an array has a wrong shape.
 
         Args:
-            pos_w: of the vehicle's centre of mass [m], shape (E, 3), world frame.
+            pos_w: position of the vehicle's centre of mass [m], shape (E, 3), world frame.
             quat_wb: attitude, xyzw, shape (E, 4).
             vel_w: [m/s], shape (E, 3). rate_b: [rad/s], shape (E, 3).
-            payload_w: of the payload's centre [m], shape (E, 3).
-            goal_w: [m], shape (E, 3) or (3,).
-            attached: whether the payload hangs on the vehicle, shape (E,) or one for all.
-            keypoints: of a detector, normalised, shape (E, 8, 2), and validity, shape (E, 8), in
-                place of the projections of payload and goal; only with a camera.
-            now: time of this step on any clock [s], where steps may be late or missing; None: they
-                come a period apart.
+            payload_w: position of the payload's centre [m], shape (E, 3).
+            goal_w: position of the goal [m], shape (E, 3) or (3,).
+            attached: whether the payload is attached to the vehicle, shape (E,) or one for all.
+            keypoints: keypoints of a detector, normalised, shape (E, 8, 2), and validity, shape
+                (E, 8), instead of projections of payload and goal; only with a camera.
+            now: time of this step on any clock [s], if steps may be late or missing; None if they
+                are exactly one period apart.
         """
         begin = time.perf_counter()
         goal_w = np.asarray(goal_w).reshape(-1, 3)
@@ -244,21 +246,21 @@ class Pilot:
 
     @torch.inference_mode()
     def rehearse(self) -> None:
-        """Work out the last call once more and forget it, so that the next one finds weights and
-        code in the processor's caches.
+        """Repeat the computation of the last call without an effect, so that weights and code are
+        in the processor's caches for the next one.
         """
         if self._shown:
             self._network.step(self._see(*self._shown).observation, self._memory)
 
     def cancel_release(self) -> None:
-        """Report that the release which the last call commanded was not done: the next observation
-        holds none, as in training.
+        """Report that the release commanded by the last call was not executed; the next observation
+        then contains no release, as in training.
         """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
     def _native(self, array: ndarray) -> Array:
-        """Return an array as what the observation is computed on: arrays for one vehicle, else
-        tensors.
+        """Convert an array to the type of the observation's computation: a NumPy array for one
+        vehicle, otherwise a tensor.
         """
         return np.asarray(array) if self.count == 1 else torch.as_tensor(array)
 
@@ -266,12 +268,12 @@ class Pilot:
         return self._native(np.zeros(shape, dtype=np.float32))
 
     def _bridge_gap(self, timestamp: float, inputs: PolicyInput) -> bool:
-        """Make history and response those of steps a period apart, as in training; whether steps
-        before this one were late or missing.
+        """If earlier steps were late or missing, resample history and response to steps one period
+        apart, as in training; return whether this was necessary.
 
         Args:
-            timestamp: of this step [s].
-            inputs: of this step.
+            timestamp: time of this step [s].
+            inputs: the policy's input of this step.
         """
         times = self._times
         period = self.period
@@ -296,7 +298,7 @@ class Pilot:
     def _stack_measurements(self, *views: ndarray | bool) -> list[Array]:
         """Return the measurements of one step in the order of :data:`VIEWS`, float32, E rows each.
 
-        Raises ValueError: one of another shape.
+        Raises ValueError: one has a wrong shape.
         """
         rows = []
         for (name, width), value in zip(VIEWS.items(), views):
@@ -313,12 +315,12 @@ class Pilot:
         return rows
 
     def _see(self, views: list[Array], detected: tuple[Array, Array] | None) -> PolicyInput:
-        """Assemble the observation of a step from its measurements and what is remembered.
+        """Assemble the observation of a step from its measurements and the stored state.
 
         Args:
-            views: see :data:`VIEWS`.
-            detected: keypoints and validity by a detector; None: what the camera sees of goal and
-                payload, where there is one.
+            views: measurements; see :data:`VIEWS`.
+            detected: keypoints and validity from a detector; None to project goal and payload into
+                the camera, if there is one.
         """
         pos, quat, vel, rate, payload, goal, attached = views
         layout = self.layout
@@ -357,10 +359,10 @@ class Pilot:
     def see(
         self, pos_w: ndarray, quat_wb: ndarray, payload_w: ndarray, goal_w: ndarray
     ) -> tuple[ndarray, ndarray]:
-        """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity,
-        shape (E, 8).
+        """Return the keypoints of :meth:`act` without a decision, shape (E, 8, 2), and their
+        validity, shape (E, 8).
 
-        Raises PolicyError: there is no camera; ValueError: an array of another shape.
+        Raises PolicyError: there is no camera; ValueError: an array has a wrong shape.
         """
         if self.camera is None:
             raise PolicyError("this pilot has no camera")

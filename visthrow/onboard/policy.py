@@ -1,16 +1,16 @@
-"""The exported policy: a small network, the conditions that it was trained under, and how it was
-made.
+"""The exported policy: a small network, the conditions of its training, and its provenance.
 
 Onboard-safe: torch, numpy and json only. The file is an ``.npz`` without pickle:
 ``layer<i>_weight`` and ``layer<i>_bias`` (float32), optionally ``normalizer_mean``,
 ``normalizer_std``, ``normalizer_eps``, and ``header``, JSON text with ``format_version``,
-``activation``, ``contract`` and ``made_by``. A policy with a memory has its estimator too,
-``estimator_<field>``, and format version 2.
+``activation``, ``contract`` and ``made_by``. The file of a policy with a memory also holds its
+estimator, ``estimator_<field>``, and has format version 2.
 
-``contract`` is a nested dictionary of everything that a flight of the policy must share with its
-training: camera, mount, action limits, release lag, vehicle, observation layout.
-``contract["observation"]["dimension"]`` and ``contract["action"]["dimension"]``, where given, must
-fit the network. ``made_by`` tells config, commit, command, seed and figures; nothing depends on it.
+``contract`` is a nested dictionary of all conditions that a flight of the policy must share with
+its training: camera, mount, action limits, release lag, vehicle, observation layout.
+``contract["observation"]["dimension"]`` and ``contract["action"]["dimension"]``, if present, must
+match the network. ``made_by`` records config, commit, command, seed and figures; nothing depends on
+it.
 """
 
 import json
@@ -33,34 +33,34 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.shipped import find_policy as find_policy
 
 FORMAT_VERSIONS = (1, 2)
-"""Without and with an estimator."""
+"""Versions without and with an estimator."""
 
 NORMALIZER = ("normalizer_mean", "normalizer_std", "normalizer_eps")
 ESTIMATOR = "estimator_"
-"""Names in the file: of the normaliser, and what those of the estimator begin with."""
+"""Names of the normaliser's entries in the file, and prefix of the estimator's."""
 
 RELATIVE_TOLERANCE = 1e-9
-"""Two numbers of a contract are the same up to this: what a round trip through text or a unit
-conversion may cost.
+"""Relative difference up to which two numbers of a contract are equal; it covers rounding by a
+conversion to text or of units.
 """
 
 RSL_RL_EPS = 1e-2
-"""What rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part of its
-state.
+"""Constant that rsl_rl 5.5's EmpiricalNormalization adds to the standard deviation; it is not part
+of its state.
 """
 
 ACTIVATIONS: dict[str, dict[str, str]] = tables_beside(__file__, "activations.toml")
-"""Activations by rsl_rl's names, and what torch, ONNX and C call them."""
+"""Activation by rsl_rl's name -> its names in torch, ONNX and C."""
 
 
 @dataclass(frozen=True)
 class Policy:
     """A multi-layer perceptron ``obs (E, D) -> action (E, A)`` with an optional fixed normaliser
-    before it.
+    of its input.
 
-    With an estimator the perceptron looks at the estimate (E, S) in place of the observation, and
-    the policy has a memory. Raises PolicyError if shapes do not fit each other or the contract, a
-    number is not finite, or the activation is unknown."""
+    With an estimator the perceptron's input is the estimate (E, S) instead of the observation, and
+    the policy has a memory. Raises PolicyError: shapes are inconsistent or contradict the contract,
+    a number is not finite, or the activation is unknown."""
 
     weights: tuple[Tensor, ...]  # (out, in) each
     biases: tuple[Tensor, ...]  # (out,) each
@@ -85,19 +85,19 @@ class Policy:
 
     @property
     def obs_dim(self) -> int:
-        """Number of observations D."""
+        """Return the number D of observations."""
         if self.estimator is None:
             return self.weights[0].shape[1]
         return self.estimator.obs_dim
 
     @property
     def action_dim(self) -> int:
-        """Number of actions A."""
+        """Return the number A of actions."""
         return self.weights[-1].shape[0]
 
     @property
     def total_mass(self) -> float:
-        """Mass of the vehicle with all that hangs on it, by the contract [kg]."""
+        """Return the mass of vehicle, rope and payload in the contract [kg]."""
         rope = self.contract["rope"]
         return float(
             self.contract["vehicle"]["body"]["mass"] + (rope["rope_mass"] + rope["payload_mass"])
@@ -105,10 +105,11 @@ class Policy:
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
-        """Return the deterministic action. Raises PolicyError if the last axis is not D long.
+        """Return the deterministic action. Raises PolicyError: the last axis does not have length
+        D.
 
         Args:
-            obs: Observations as in training, shape (E, D); taken to the policy's dtype.
+            obs: Observations as in training, shape (E, D); converted to the policy's dtype.
 
         Returns:
             Normalised actions, unclipped, shape (E, A).
@@ -120,7 +121,9 @@ class Policy:
         return self.decide(self._check_shape(obs))
 
     def begin(self, count: int) -> Tensor:
-        """Memory at the beginning of a throw, shape (E, H); H is 0 for a policy without one."""
+        """Return the memory at the start of a throw, shape (E, H); H is 0 for a policy without
+        memory.
+        """
         if self.estimator is None:
             width = 0
         else:
@@ -130,10 +133,10 @@ class Policy:
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the action as :meth:`act`, shape (E, A), and the memory for the next step, shape
+        """Return the action of :meth:`act`, shape (E, A), and the memory for the next step, shape
         (E, H).
 
-        Raises PolicyError if the last axis of the observations is not D long.
+        Raises PolicyError: the last axis of the observations does not have length D.
         """
         fitted = self._check_shape(obs)
         if self.estimator is not None:
@@ -141,8 +144,8 @@ class Policy:
         return self.decide(fitted), memory
 
     def actor(self, count: int) -> Callable[[Tensor], Tensor]:
-        """Return the function of the observations of one throw after the other step, shape (E, D);
-        it carries the memory, where there is one.
+        """Return a function of the observations of successive steps, shape (E, D), which keeps the
+        memory, if any, between calls.
         """
         if self.estimator is None:
             return self.act
@@ -164,8 +167,8 @@ class Policy:
         return obs.to(self.weights[0].dtype)
 
     def decide(self, x: Tensor) -> Tensor:
-        """Return the action of the perceptron alone, shape (E, A), for what it looks at, shape (E,
-        S); differentiable.
+        """Return the action of the perceptron, shape (E, A), for its input, shape (E, S);
+        differentiable.
         """
         if self.mean is not None and self.std is not None:
             x = (x - self.mean) / (self.std + self.eps)
@@ -175,7 +178,7 @@ class Policy:
         return F.linear(x, self.weights[-1], self.biases[-1])
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all numbers by their names in the file."""
+        """Return all tensors by their names in the file."""
         named: dict[str, Tensor] = {}
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             named |= {f"layer{i}_weight": weight, f"layer{i}_bias": bias}
@@ -198,18 +201,18 @@ class Policy:
         sections: Collection[str] | None = None,
         allow: Collection[str] = (),
     ) -> dict[str, Any]:
-        """Refuse to serve under other conditions than those of the training.
+        """Refuse a flight under conditions that differ from those of the training.
 
-        Raises MismatchError: naming every key that differs without allowance, with both values.
+        Raises MismatchError: conditions differ; the message names each such key with both values.
 
         Args:
-            contract_now: The conditions here, as the training wrote them.
+            contract_now: The present conditions, in the form of a contract.
             sections: Top-level keys to compare; all if None.
-            allow: Keys of tables or values that may differ, ``("vehicle", "observation.latency")``:
-                an experiment's stated departures from the training.
+            allow: Keys of tables or values that may differ, such as
+                ``("vehicle", "observation.latency")``.
 
         Returns:
-            What differs by allowance: dotted key -> the value here, None where there is nothing.
+            Allowed differences: dotted key -> the present value, None if there is none.
         """
         trained = flatten(self.contract, sections)
         current = flatten(contract_now, sections)
@@ -234,8 +237,8 @@ class Policy:
     def save(self, path: str | Path) -> None:
         """Write the policy file, whole or not at all.
 
-        Raises PolicyError if contract or made_by cannot be written as JSON; StorageError if the
-        place cannot be written."""
+        Raises PolicyError: contract or made_by cannot be written as JSON; StorageError: the file
+        cannot be written."""
         header = {
             "format_version": FORMAT_VERSIONS[self.estimator is not None],
             "activation": self.activation,
@@ -252,8 +255,8 @@ class Policy:
     def load(path: str | Path, device: str | torch.device = "cpu") -> "Policy":
         """Read a policy file.
 
-        Raises PolicyError if the file is missing, cut short, of another version or incomplete, or
-        contradicts itself."""
+        Raises PolicyError: the file is missing, truncated, incomplete, inconsistent, or of another
+        version."""
         arrays = loadz(path, PolicyError, "a policy file written by `visthrow train`")
         try:
             header = _header(arrays)
@@ -273,19 +276,18 @@ class Policy:
         contract: dict[str, Any],
         made_by: dict[str, Any] | None = None,
     ) -> "Policy":
-        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian of
-        its own spread.
+        """Build the policy from the state of an rsl_rl 5.5 ``MLPModel`` actor with a Gaussian
+        whose spread is a parameter.
 
-        Raises PolicyError if the state holds anything else (another model class), or does not fit
-        the contract.
+        Raises PolicyError: the state belongs to another model class or contradicts the contract.
 
         Args:
             state: ``actor.state_dict()``: ``mlp.<i>.weight``, ``mlp.<i>.bias``,
-                ``obs_normalizer._mean`` and ``._std``; the spread under ``distribution.`` plays no
-                part in the deterministic action.
+                ``obs_normalizer._mean`` and ``._std``; the spread under ``distribution.`` does not
+                affect the deterministic action.
             activation: The actor's hidden activation by rsl_rl's name.
             contract: Conditions of the training.
-            made_by: Where it comes from.
+            made_by: Provenance.
         """
         prefixes = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(prefixes))
@@ -316,7 +318,10 @@ class Policy:
 
 
 def named_activation(policy: Policy, language: str, kind: str) -> str:
-    """Return what another language calls a policy's activation; PolicyError where it has none."""
+    """Return the name of a policy's activation in another language.
+
+    Raises PolicyError: the language has none.
+    """
     names = {name: table[language] for name, table in ACTIVATIONS.items() if language in table}
     if policy.activation not in names:
         raise PolicyError(
@@ -366,8 +371,9 @@ def _check_shapes(policy: Policy) -> None:
 
 
 def _fields_of(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Return the fields of a policy by :meth:`Policy.tensors`; raises PolicyError where one is
-    missing.
+    """Return the fields of a policy from :meth:`Policy.tensors`.
+
+    Raises PolicyError: a tensor is missing.
     """
     count = sum(name.startswith("layer") and name.endswith("_weight") for name in tensors)
     fields: dict[str, Any] = {
@@ -420,7 +426,7 @@ def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
 
 
 def flatten(tree: Mapping[str, Any], sections: Collection[str] | None = None) -> dict[str, Any]:
-    """Flatten nested dictionaries and lists to dotted keys; an empty one stays as a value."""
+    """Flatten nested dictionaries and lists to dotted keys; an empty one remains as a value."""
     flat: dict[str, Any] = {}
 
     def walk(value: Any, path: str) -> None:

@@ -1,6 +1,6 @@
-"""The keypoints that one vehicle's camera sees, in plain floats: what the runner projects.
+"""Project the keypoints of one vehicle's camera in plain floats, for the runner.
 
-On a single row `camera.keypoints.keypoints` takes a multiple of the time; this gives the same to
+For a single row this is several times faster than `camera.keypoints.keypoints`; results agree to
 2e-6. Onboard-safe."""
 
 import math
@@ -26,7 +26,7 @@ def row_keypoints(
     """Return keypoints, float32, shape (1, 8, 2), and validity, shape (1, 8).
 
     Args:
-        camera: of `KeypointCamera.convert_to_arrays`. The others: as of
+        camera: camera from `KeypointCamera.convert_to_arrays`. Others: see
             `camera.keypoints.keypoints`, with a batch of one.
     """
     lens = camera.fisheye
@@ -55,8 +55,8 @@ def _radius_and_slope(lens: Fisheye, theta: float) -> tuple[float, float]:
 
 
 def _project(lens: Fisheye, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Return `Fisheye.project_normalized` of a ray, clipped: both coordinates, and whether it is
-    inside the field of view.
+    """Return `Fisheye.project_normalized` of a ray, clipped: both coordinates, and whether the ray
+    is inside the field of view.
     """
     lateral = math.sqrt(x * x + y * y + AXIS_EPSILON)
     theta = math.atan2(lateral, z)

@@ -1,7 +1,7 @@
-"""A policy for one vehicle on NumPy arrays, which decides the same as in torch to rounding.
+"""A policy for one vehicle on NumPy arrays, with the same actions as in torch up to rounding.
 Onboard-safe.
 
-Reading the weights is what takes the time. They lie in memory in the order in which the product
+Most of the time goes into reading the weights. They are stored in the order in which the product
 with a row reads them."""
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ def _elu(x: ndarray) -> ndarray:
 
 
 def _sigmoid(x: ndarray) -> ndarray:
-    """Return the logistic function, by a form that never overflows."""
+    """Return the logistic function, computed without overflow."""
     return 0.5 + 0.5 * np.tanh(0.5 * x)
 
 
@@ -45,10 +45,10 @@ def _activation(name: str) -> Callable[[ndarray], ndarray]:
 
 
 class RowPolicy:
-    """See `visthrow.onboard.policy.Policy`."""
+    """A `visthrow.onboard.policy.Policy` for a single row."""
 
     def __init__(self, policy: Policy):
-        """Copy the weights of a policy on the CPU."""
+        """Copy the weights of a policy that is on the CPU."""
         *hidden, self._last = map(_layer, policy.weights, policy.biases)
         self._hidden = hidden
         self._activation = _activation(policy.activation)
@@ -60,7 +60,7 @@ class RowPolicy:
             self._estimator = RowEstimator(policy.estimator)
 
     def step(self, obs: ndarray, memory: ndarray) -> tuple[ndarray, ndarray]:
-        """Return action and new memory as `Policy.step`, all of shape (1, ...)."""
+        """Return action and new memory of `Policy.step`, all of shape (1, ...)."""
         x = obs
         if self._estimator is not None:
             x, memory = self._estimator.step(obs, memory)
@@ -73,7 +73,7 @@ class RowPolicy:
 
 
 class RowEstimator:
-    """See `visthrow.onboard.estimator.Estimator`."""
+    """A `visthrow.onboard.estimator.Estimator` for a single row."""
 
     def __init__(self, estimator: Estimator):
         """Copy the weights."""
@@ -89,7 +89,7 @@ class RowEstimator:
         self._width = e.memory
 
     def step(self, obs: ndarray, memory: ndarray) -> tuple[ndarray, ndarray]:
-        """Return estimate and new memory as `Estimator.step`, all of shape (1, ...)."""
+        """Return estimate and new memory of `Estimator.step`, all of shape (1, ...)."""
         width = self._width
         x = (obs - self._mean) / self._std
         for layer in self._encoder:

@@ -1,17 +1,17 @@
-"""Folders of policies. Quick to import: a misspelt name is reported at once. Onboard-safe."""
+"""Find policy files. Quick to import, so that a misspelt name is reported at once. Onboard-safe."""
 
 from pathlib import Path
 
 from visthrow.common.errors import PolicyError, suggest
 
-# folder of the policies that come with the package
+# folder of the policies in the package
 SHIPPED = Path(__file__).resolve().parent / "policies"
 
 
 def find_policy(name: str | Path) -> Path:
     """Find a policy by the name of a shipped one (``vision``) or by the path of a file.
 
-    Raises PolicyError if there is neither; the message lists what exists.
+    Raises PolicyError: neither exists; the message lists the shipped ones.
     """
     for candidate in (Path(name), SHIPPED / f"{name}.npz"):
         if candidate.is_file():

@@ -1,1 +1,1 @@
-"""What people look at: recordings for rerun, strips, scatter plots, tables, pages."""
+"""Output for people: recordings for rerun and Foxglove, pictures, tables and pages."""

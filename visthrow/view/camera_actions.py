@@ -34,15 +34,15 @@ from visthrow.common.storage import atomic_write
 
 BLUE = (230, 120, 40)
 YELLOW = (60, 210, 240)
-SAMPLES = 16  # rays a pixel of a rendered frame
+SAMPLES = 16  # rays for each pixel of a rendered frame
 
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-# chance at which a better fit by the eight free numbers of a lens counts as noise (F test)
+# significance level at which a lens's eight parameters fit better than by chance (F test)
 SIGNIFICANT = 1e-3
 
 
 def board_of(words: list[str] | None) -> BoardParams:
-    """Board of the words after ``--board``; ConfigError where they name none."""
+    """Parse the words after ``--board``. Raises ConfigError: they do not describe a board."""
     expected = f"--board {BOARD}, for instance: --board chessboard 7 5 0.04"
     if (
         not words
@@ -60,8 +60,9 @@ def board_of(words: list[str] | None) -> BoardParams:
 
 
 def pictures_of(names: list[str]) -> tuple[list[Path], list[ndarray]]:
-    """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3); ConfigError where a file
-    is none, or there is none.
+    """Read pictures from files and folders as BGR, uint8, shape (H, W, 3).
+
+    Raises ConfigError: a file is not a picture, or there are no pictures.
     """
     paths: list[Path] = []
     for name in map(Path, names):
@@ -83,7 +84,7 @@ def pictures_of(names: list[str]) -> tuple[list[Path], list[ndarray]]:
 
 
 def calibrate(args: argparse.Namespace) -> int:
-    """Write a camera config."""
+    """Calibrate from pictures or convert a calibration file, and write a camera config."""
     out = Path(args.out)
     if out.suffix != ".toml":
         raise ConfigError(
@@ -135,7 +136,7 @@ def calibrate(args: argparse.Namespace) -> int:
 
 
 def check(args: argparse.Namespace) -> int:
-    """Print reprojection errors and the verdict; 1 where the lens does not fit."""
+    """Print reprojection errors and the verdict; return 1 if the lens does not fit."""
     camera = config.load(CameraParams, config.find("camera", args.config))
     board = board_of(args.board)
     paths, images = pictures_of(args.pictures)
@@ -151,14 +152,14 @@ def check(args: argparse.Namespace) -> int:
 
 
 def verdict(camera: CameraParams, report: BoardReport, best: BoardReport) -> tuple[bool, str]:
-    """Tell whether a configured lens fits pictures of a board.
+    """Return whether a configured lens fits pictures of a board, and a sentence with the reason.
 
-    What the configured lens leaves beyond the best lens is a systematic error. It is accepted where
-    it is not significant (F test of eight free numbers), or below the bias that training draws for
-    each episode (``noise.bias_std``).
+    The excess of its reprojection error over that of the best lens is a systematic error. It is
+    accepted if it is not significant (F test of eight parameters) or below the bias that training
+    draws for each episode (``noise.bias_std``).
 
     Args:
-        camera: the configuration. report: its reprojection errors. best: those of the lens
+        camera: the configuration. report: its reprojection errors. best: those of the lens that was
             calibrated on the same pictures.
     """
     from scipy.stats import f
@@ -199,7 +200,7 @@ def sentence(lens: FisheyeParams) -> str:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Write the picture, print what is in view."""
+    """Write a picture with the projected keypoints and print which of them are in view."""
     out = Path(args.out)
     if out.suffix.lower() not in PICTURES:
         raise ConfigError(f"--out {out}; expected a picture, one of {', '.join(PICTURES)}")
@@ -241,7 +242,7 @@ def show(args: argparse.Namespace) -> int:
 
 
 def _render(params: CameraParams, *places: torch.Tensor) -> ndarray:
-    """Render a grey hall with vehicle, ball and goal square; BGR, uint8, shape (H, W, 3)."""
+    """Render a grey hall with vehicle, ball and goal square as BGR, uint8, shape (H, W, 3)."""
     eyes = load_extra("visthrow.detector_training.eyes", "detector", "a picture", ConfigError)
     return eyes.render_hall(params, *places, samples=SAMPLES)
 
@@ -264,7 +265,7 @@ def _draw_board(canvas: ndarray, image: ndarray, lens: Fisheye, args: argparse.N
 
 
 def _straight(canvas: ndarray, lens: Fisheye, fov_deg: float) -> ndarray:
-    """Rectified view of a drawn picture, BGR, uint8, square."""
+    """Return the rectified view of a drawn picture, BGR, uint8, square."""
     size = min(lens.params.width, lens.params.height)
     frames = torch.from_numpy(canvas).permute(2, 0, 1)[None].float() / 255.0
     flat = rectify(frames, lens, ViewParams(size, size, fov_deg))[0].permute(1, 2, 0)

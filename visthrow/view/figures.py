@@ -1,6 +1,5 @@
-"""Picture of where throws land, and what pictures of several panels share.
-
-All in the style of :mod:`visthrow.view.style`.
+"""Draw landing points, and lay out pictures with several panels, in the style of
+:mod:`visthrow.view.style`.
 """
 
 from collections.abc import Sequence
@@ -13,13 +12,13 @@ from visthrow.common.toml_text import tables_beside
 from visthrow.view import style
 from visthrow.view.parts import png_of
 
-WIDTH = 9.2  # width of a picture over the whole page [inch]
+WIDTH = 9.2  # width of a picture that fills the page [inch]
 
 
 LOOKS = style.looks_of(tables_beside(__file__, "data/looks.toml"))
 """Part of a picture -> matplotlib's keywords."""
 
-CIRCLES = (0.1, 0.2, 0.4)  # about the target, in scatter panels [m]
+CIRCLES = (0.1, 0.2, 0.4)  # radii of circles about the target in scatter panels [m]
 
 
 def look_of(series: int) -> tuple[str, str]:
@@ -30,8 +29,8 @@ def look_of(series: int) -> tuple[str, str]:
 def panel_axes(
     count: int, columns: int, width: float, height: float, margin: float, sharex: bool = False
 ) -> tuple[Any, Any]:
-    """Return a figure so wide [inch] with axes for ``count`` panels, each row so high, and some
-    room more.
+    """Return a figure with axes for ``count`` panels; ``width``: of the figure, ``height``: of each
+    row, ``margin``: additional height [inch].
     """
     rows = -(-count // columns)
     size = (width, height * rows + margin)
@@ -42,7 +41,7 @@ def panel_axes(
 
 
 def label_axes(axes: Any, below: str | None, ylabel: str, **look: Any) -> None:
-    """Name the outer axes of a grid."""
+    """Label the outer axes of a grid."""
     for axis in axes[-1] if below else ():
         axis.set_xlabel(below, **look)
     for axis in axes[:, 0]:
@@ -54,10 +53,10 @@ def scatter(
     columns: int = 3,
     heading: str = "",
 ) -> bytes:
-    """Landing points from above, the throw upwards.
+    """Draw landing points from above, with the direction of the throw upwards; return a PNG.
 
-    A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to
-    the left."""
+    A panel is a title and, for each colour, a label and landing points relative to the target,
+    shape (N, 2) [m]: along the throw, and to the left."""
     sets = [points for _, series in panels for _, points in series if len(points)]
     reach = max((np.abs(points).max() for points in sets), default=0.2)
     half = float(np.clip(1.06 * reach, 0.12, 0.7))
@@ -102,7 +101,7 @@ def _target(axis, half: float) -> None:
 
 
 def _landings(axis, points: ndarray, half: float, series: int, label: str) -> None:
-    """Points outside the panel stand at its edge, hollow; a thick cross marks their mean."""
+    """Draw landing points, hollow at the edge if they are outside the panel, and their mean."""
     colour, marker = look_of(series)
     clipped = np.clip(points, -half, half)
     visible = np.all(clipped == points, axis=1)

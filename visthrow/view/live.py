@@ -1,4 +1,4 @@
-"""rerun's web viewer, served to this machine alone. Onboard-safe."""
+"""Serve rerun's web viewer to this machine only. Onboard-safe."""
 
 import socket
 import subprocess
@@ -12,16 +12,16 @@ from urllib.parse import quote
 from visthrow.common.errors import DeviceError
 
 HOST = "127.0.0.1"
-# ports of the viewer's page and of its data; only this machine is listened to
+# ports of the viewer's page and of its data
 WEB_PORT = 9090
 DATA_PORT = 9876
 
 
 @contextmanager
 def web_viewer(layout: Any, web_port: int, data_port: int) -> Iterator[Any]:
-    """Serve the viewer with one recording and say where; gives the stream that it shows.
+    """Serve the viewer with one recording and print its address; yields the recording's stream.
 
-    DeviceError where a port is taken.
+    Raises DeviceError: the viewer did not start, as with a port in use.
     """
     import rerun as rr
 
@@ -60,7 +60,7 @@ def web_viewer(layout: Any, web_port: int, data_port: int) -> Iterator[Any]:
 
 
 def _answers(server: subprocess.Popen, port: int) -> bool:
-    """Whether a server of ours listens on a port within half a minute."""
+    """Return whether the server that we started listens on a port within half a minute."""
     for _ in range(300):
         time.sleep(0.1)
         if server.poll() is not None:

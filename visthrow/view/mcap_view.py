@@ -1,8 +1,8 @@
-"""A flight as an MCAP file for Foxglove and other readers: transforms, the scene, the image plane,
-commands, all signals. Onboard-safe.
+"""Write a flight as an MCAP file for Foxglove and other readers: transforms, the scene, the image
+plane, commands and all signals. Onboard-safe.
 
-Messages are JSON with Foxglove's schemas where there is one, so that its 3D and image panels show
-them without a plug-in. Log time counts from the first sample of the flight."""
+Messages are JSON, with Foxglove's schemas if they exist, so that its 3D and image panels show them
+without a plug-in. Log time starts at the first sample of the flight."""
 
 import base64
 import io
@@ -23,26 +23,26 @@ from visthrow.common.storage import atomic_write
 from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import FlightLog
 
-IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
+IMAGE_PERIOD = 0.04  # time between pictures of the image plane [s]
 
 _SCHEMAS = Path(__file__).parent / "data/mcap_schemas.json"
-"""Name -> JSON schema, of Foxglove's and of ours.
+"""File of name -> JSON schema, Foxglove's and our own.
 
-Rates are in rad/s; a signal's unit and frame are its channel's metadata.
+Rates are in rad/s; a signal's unit and frame are in its channel's metadata.
 """
 
 SCENE = tables_beside(__file__, "data/mcap_scene.toml")
-"""Thing of the 3D panel -> how it looks."""
+"""Object in the 3D panel -> its style."""
 
 Message = tuple[float, str, str, dict[str, Any]]
-"""Time [s], topic, schema, content; `write` adds the time to a content of Foxglove's."""
+"""Time [s], topic, schema, content; `write` adds the time to the content of Foxglove's schemas."""
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     """Write a flight of :func:`visthrow.throws.recorded.fly`, or of a run, whole or not at all.
 
     Raises LogError: the package mcap is not installed, or the log has no sample; StorageError: the
-    place cannot be written."""
+    file cannot be written."""
     writing = load_extra("mcap.writer", "recordings", f"{path}: an MCAP file", LogError)
     stamps = [channel.time[0] for channel in log.channels.values() if len(channel.time)]
     if not stamps:
@@ -76,7 +76,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 
 def _messages(log: FlightLog, experiment: Any) -> Iterator[Message]:
-    """Messages of a whole flight, topic after topic."""
+    """Yield the messages of a whole flight, topic by topic."""
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
         for time, place, turn in zip(log["pos_w"].time, log["pos_w"].values, turns, strict=True):
@@ -117,7 +117,7 @@ def _place(time: float, topic: str, pose: dict[str, Any]) -> Message:
 
 
 def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
-    """Rope, ball and goal as things of the 3D panel."""
+    """Yield rope, ball and goal as objects of the 3D panel."""
 
     def make_message(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
         entity = {"frame_id": "world", "id": name, "frame_locked": False, kind: [shape]}
@@ -140,7 +140,7 @@ def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
 
 
 def _pictures(log: FlightLog, experiment: Any) -> Iterator[Message]:
-    """The image plane with its keypoints, as pictures of the camera's size."""
+    """Yield the image plane with its keypoints as pictures of the camera's size."""
     if "keypoints" not in log or "keypoints_valid" not in log:
         return
     camera = KeypointCamera(experiment.camera)

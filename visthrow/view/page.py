@@ -1,4 +1,4 @@
-"""Puts sections into one self-contained page, and into Markdown with its pictures beside it."""
+"""Write sections as one self-contained HTML page, and as Markdown with separate pictures."""
 
 import base64
 import html
@@ -12,22 +12,22 @@ from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.templates import render
 
 PAGE = "report.html"
-"""In the folder of a report."""
+"""File in the folder of a report."""
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
 LEADS = {"missing": "*Missing.* ", "finding": "- "}
-"""Kind of a paragraph -> what stands before it in Markdown."""
+"""Kind of a paragraph -> its prefix in Markdown."""
 
 _CODE = re.compile(r"`(.+?)`")
 
 
 def _mark_up(text: str) -> str:
-    """HTML of a paragraph with its bold words and code."""
+    """Return a paragraph as HTML, with bold words and code."""
     return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
 
 
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the whole page; it loads nothing from elsewhere."""
+    """Return the whole page as HTML that loads no other files."""
     import markupsafe
 
     return render(
@@ -42,12 +42,12 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 
 def _inline(png: bytes) -> str:
-    """Return a picture as an address that holds it."""
+    """Return a picture as a data URL."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
-    """Return the page as Markdown; pictures are named as :func:`write` writes them."""
+    """Return the page as Markdown, which refers to the picture files of :func:`write`."""
     lines = [f"# {title}", lead]
     for section in sections:
         lines.append(f"## {section.title}")
@@ -62,7 +62,7 @@ def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 
 def write(folder: Path, title: str, lead: str, sections: Sequence[Section]) -> list[Path]:
-    """Write ``report.html``, ``report.md`` and the pictures; returns the paths, the page first."""
+    """Write ``report.html``, ``report.md`` and the pictures; return the paths, the page first."""
     paths = [folder / PAGE, folder / "report.md"]
     for section in sections:
         for part in section.parts:

@@ -1,15 +1,15 @@
-"""What a section is made of, the same for the page and for Markdown."""
+"""Parts of a section, which the page and Markdown share."""
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-DPI = 150.0  # of pictures
+DPI = 150.0  # resolution of pictures
 
 
 def align(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | None = None) -> str:
-    """Return a table as Markdown, columns aligned: the first ``heads`` columns stand left, all of
-    them without it, the others right.
+    """Return a table as Markdown with aligned columns: the first ``heads`` columns (default all) to
+    the left, the others to the right.
     """
     cells = [header, *rows]
     width = [max(len(row[i]) for row in cells) for i in range(len(header))]
@@ -31,14 +31,14 @@ class Text:
     """A paragraph; ``**bold**`` and ``code`` in backticks are marked in both outputs."""
 
     text: str
-    # "plain", "finding": said by the figures; "missing": what is not there; "why": written beside
-    # the data
+    # "plain"; "finding": follows from the figures; "missing": names absent data; "why": an
+    # explanation
     kind: str = "plain"
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table: every cell is text; the first ``heads`` columns stand left, the others right."""
+    """A table of text cells; the first ``heads`` columns are aligned left, the others right."""
 
     title: str
     header: tuple[str, ...]
@@ -57,8 +57,8 @@ class Grid:
     ) -> "Grid | None":
         """Return a table, or None without rows.
 
-        ``header``: headings, with `` | `` between two. ``rows``: cells in their order, or by
-        heading, where "-" stands for what a row lacks."""
+        ``header``: headings, separated by `` | ``. ``rows``: cells in order, or by heading; a
+        missing cell becomes "-"."""
         names = header.split(" | ")
         cells = []
         for row in rows:
@@ -70,7 +70,7 @@ class Grid:
         return None
 
     def markdown(self) -> str:
-        """Text of the table, columns aligned."""
+        """Return the table as Markdown with aligned columns."""
         return f"**{self.title}**\n\n{align(self.header, self.rows, self.heads)}" + (
             f"\n\n{self.note}" if self.note else ""
         )
@@ -78,7 +78,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as PNG; ``name`` is its file beside the Markdown."""
+    """A figure as PNG; ``name`` is the stem of its file."""
 
     name: str
     png: bytes
@@ -104,7 +104,7 @@ def section(
     missing: Sequence[str] = (),
     head: str = "Not thrown yet",
 ) -> Section:
-    """Return a section of the parts that there are; at its end what is missing."""
+    """Return a section of the parts that are not None, with a final sentence on missing data."""
     listed = list(filter(None, parts))
     reasons = "; ".join(dict.fromkeys(missing))
     if reasons:
@@ -113,11 +113,12 @@ def section(
 
 
 def png_of(figure) -> bytes:
-    """Bytes of a matplotlib figure, which is closed."""
+    """Return a matplotlib figure as PNG and close it."""
     import matplotlib.pyplot as plt
 
     buffer = io.BytesIO()
-    if layout := figure.get_layout_engine():  # done here: for its sake all would be drawn twice
+    # done here, as savefig would draw everything twice for it
+    if layout := figure.get_layout_engine():
         figure.set_dpi(DPI)
         layout.execute(figure)
         figure.set_layout_engine("none")

@@ -1,9 +1,9 @@
-"""A flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one time
-line. Onboard-safe.
+"""Record a flight for the rerun viewer: the scene in 3D, the image plane, and all signals on one
+time line. Onboard-safe.
 
-Time zero is the policy's start. What a log does not hold is not shown: a flight on
-motion capture knows no motor speeds, a simulated one no age of its poses. Sizes come from an
-experiment, or from anything with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``."""
+Time zero is the policy's start. Only the channels in a log are shown: a flight with motion capture
+has no motor speeds, and a simulated one no age of its poses. Sizes come from an experiment, or from
+an object with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``."""
 
 import tempfile
 from collections.abc import Iterator
@@ -27,21 +27,21 @@ from visthrow.view import style
 
 TIMELINE = "throw_time"
 SIGNALS = tables_beside(__file__, "data/signals.toml")
-FIELD = 2.0  # half-width of the drawn floor about the throw [m]
+FIELD = 2.0  # margin of the drawn floor around the throw [m]
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
-    """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with a blueprint
-    that lays out the viewer.
+    """Write a flight of :func:`visthrow.throws.recorded.fly` as a ``.rrd`` file with the viewer's
+    layout.
 
-    Raises StorageError: the place cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
         send_whole(stream, log, experiment)
 
 
 def send_whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
-    """Send all of a flight; arguments as of :func:`write`."""
+    """Send a whole flight; arguments: see :func:`write`."""
     draw_still_parts(stream, log.meta["goal_w"], experiment)
     send(stream, log)
     if "landing" in log:
@@ -54,10 +54,10 @@ def send_whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> N
 def recording(
     path: str | Path, layout: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """Give a stream whose content becomes a ``.rrd`` file, whole or not at all, with the layout of
-    the viewer that opens it.
+    """Yield a stream whose content is written to a ``.rrd`` file, whole or not at all, with the
+    viewer's layout.
 
-    Raises StorageError: the place cannot be written.
+    Raises StorageError: the file cannot be written.
     """
     stream = rr.RecordingStream("visthrow", recording_id=None)
     with tempfile.TemporaryDirectory() as folder:
@@ -74,18 +74,18 @@ def recording(
 
 
 def _send(stream: rr.RecordingStream, entity: str, log: FlightLog, name: str, columns: Any) -> None:
-    """Send columns that have a row for each sample of a channel."""
+    """Send columns with one row for each sample of a channel."""
     time = log[name].time - log.meta["times"]["policy_start"]
     stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time)], columns)
 
 
 def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
-    """Red, green, blue and opacity of ``#rrggbb``."""
+    """Return red, green, blue and opacity of ``#rrggbb``."""
     return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
 
 
 TRAILS = {"payload_pos_w": "world/trail/ball", "pos_w": "world/trail/vehicle"}
-"""Channel -> entity of the lines that grow during a throw."""
+"""Channel -> entity of its trail, which grows during a throw."""
 
 
 def _looks() -> dict[str, dict[str, Any]]:
@@ -98,12 +98,12 @@ def _looks() -> dict[str, dict[str, Any]]:
 
 
 LOOKS = _looks()
-"""Entity -> how the viewer draws it."""
+"""Entity -> its style in the viewer."""
 
 
 def draw_still_parts(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
-    """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is
-    at ``goal_w`` [m], shape (3,).
+    """Send the static parts: ground, shapes, styles, the camera's field of view; ``goal_w``:
+    target [m], shape (3,).
     """
     _draw_scene(stream, np.asarray(goal_w, dtype=float), experiment)
     _draw_vehicle(stream, experiment.vehicle.rotors)
@@ -111,7 +111,7 @@ def draw_still_parts(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -
 
 
 def _draw(stream: rr.RecordingStream, entity: str, shape: Any, *places: Any, **values: Any) -> None:
-    """Send a shape that does not move, as :data:`LOOKS` has it."""
+    """Send a static shape with its style in :data:`LOOKS`."""
     stream.log(entity, shape(*places, **values, **LOOKS[entity]), static=True)
 
 
@@ -133,8 +133,8 @@ def _draw_scene(stream: rr.RecordingStream, goal: ndarray, experiment: Any) -> N
 
 
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Send all that moves, from a whole flight or from a piece of one; see :func:`draw_still_parts`
-    for the rest.
+    """Send the moving parts of a flight or of a part of one; :func:`draw_still_parts` sends the
+    static ones.
     """
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
@@ -175,7 +175,7 @@ def _draw_vehicle(stream: rr.RecordingStream, rotors: Any) -> None:
 
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
-    """A line that grows from the policy's start to the landing."""
+    """Send a trail that grows from the policy's start to the landing."""
     times = log.meta["times"]
     time = log[name].time
     last = times.get("landing", np.inf) + 0.02
@@ -188,21 +188,24 @@ def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -
 
 
 def trail(stream: rr.RecordingStream, name: str, time: float, points: ndarray) -> None:
-    """Send the line that a body has left so far, for flights that are still going on.
+    """Send the present trail of a body, for a flight in progress.
 
-    Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points
-    [m], shape (N, 3)."""
+    Args:
+        stream: the recording. name: channel in :data:`TRAILS`.
+        time: time of the trail's end, relative to the policy's start [s].
+        points: the trail [m], shape (N, 3).
+    """
     stream.set_time(TIMELINE, duration=time)
     stream.log(TRAILS[name], rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
 
 
 GROUPS = {"goal": slice(GOAL_KEYPOINTS), "payload": slice(GOAL_KEYPOINTS, None)}
-"""Things -> their keypoints."""
+"""Object -> its keypoints."""
 
 
 def _draw_plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
-    """Send field of view and body axes, in normalised image coordinates times 100, so that the
-    viewer's strokes fit.
+    """Send field of view and body axes in normalised image coordinates times 100, a scale that fits
+    the viewer's line widths.
     """
     import torch
 
@@ -211,7 +214,7 @@ def _draw_plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
     circle = 100 * np.column_stack((np.cos(angle), np.sin(angle)))
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
     _draw(stream, "camera/field_of_view", rr.LineStrips2D, [circle, right * circle])
-    # a strip's own label would stand in the middle, on the ball
+    # the label of a strip itself would be in the middle, on the ball
     places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
     _draw(stream, "camera/angles", rr.Points2D, places, labels=names)
@@ -226,8 +229,8 @@ def _draw_plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
 
 
 def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Keypoints in the plane of :func:`_draw_plane`; those that are not valid stand grey where they
-    read.
+    """Send keypoints in the plane of :func:`_draw_plane`; invalid ones are grey, at their recorded
+    positions.
     """
     points = 100.0 * log["keypoints"].values
     valid = log["keypoints_valid"].values.astype(bool)
@@ -243,8 +246,8 @@ def _points(stream, log: FlightLog, entity: str, points: ndarray, visible: ndarr
 
 
 def _outline(stream, log: FlightLog, name: str, points: ndarray, whole: ndarray) -> None:
-    """Closed outline of a group while all of it is visible; the payload's four are the midpoints of
-    a box's edges.
+    """Send the closed outline of a group at times when all its keypoints are visible; the payload's
+    keypoints are the midpoints of a box's edges.
     """
     if not whole.any():
         return
@@ -259,7 +262,7 @@ def _outline(stream, log: FlightLog, name: str, points: ndarray, whole: ndarray)
 
 
 def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Send a curve of each component of the channels that the log has samples for."""
+    """Send a curve for each component of the channels in the log."""
     tables = dict(SIGNALS["curves"])
     ticks = [name for name in log.channels if name.startswith("tick_")]
     for i, name in enumerate(ticks):
@@ -286,7 +289,7 @@ def _paler(colour: str) -> str:
 
 
 def blueprint(goal: ndarray, channels: set[str]) -> rrb.Blueprint:
-    """Layout of the viewer for a target [m], shape (3,), and the channels that there are."""
+    """Return the viewer's layout for a target [m], shape (3,), and the channels of a log."""
     middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
     eye = rrb.EyeControls3D(
         position=middle + [0.3, -3.4, 0.9], look_target=middle, eye_up=[0.0, 0.0, 1.0]

@@ -1,5 +1,5 @@
-"""The picture of one throw: the paper's strip of side views, and the camera's images at the same
-instants.
+"""Draw a throw as a strip of side views, as the paper does, with the camera's images at the same
+times.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # margin around the visible objects [m]
 GROUND = 0.13  # margin shown below z = 0 [m]
-# widths of the picture, its left margin, a panel, and the gap between two [inch]
+# widths of the picture, its left margin, a panel, and the gap between panels [inch]
 WIDTH = 13.6
 LEFT_MARGIN = 0.62
 PANEL = 3.06
@@ -29,15 +29,15 @@ GAP = 0.22
 
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]
-BLADE_HEIGHT = 0.018  # of the rotor plane, for drawing only [m]
-PIXELS = 480  # of the camera's picture as drawn
-GHOST_EVERY = 0.06  # between the faint earlier poses [s]
+BLADE_HEIGHT = 0.018  # height of the rotor plane, for drawing only [m]
+PIXELS = 480  # larger side of the drawn camera picture
+GHOST_EVERY = 0.06  # time between the faint earlier poses [s]
 
 
 def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
-    """Draw the strip of a flight, whose keypoints are the camera's, as a PNG file.
+    """Draw the strip of a flight, with keypoints projected by this camera, as a PNG file.
 
-    Raises LogError: the flight has no release or landing; StorageError: the place cannot be
+    Raises LogError: the flight has no release or landing; StorageError: the file cannot be
     written."""
     meta = log.meta
     times = meta["times"]
@@ -59,7 +59,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     import matplotlib.pyplot as plt
 
     side = _bounds(log)
-    upper = PANEL * (side[2] + GROUND) / (side[1] - side[0])  # heights from here on in inches
+    upper = PANEL * (side[2] + GROUND) / (side[1] - side[0])  # heights in inches from here on
     height = 1.18 + upper + 0.98 + PANEL + 0.08
     figure = plt.figure(figsize=(WIDTH, height))
     lens = KeypointCamera(shrink_lens(camera))
@@ -103,7 +103,7 @@ def _headline(log: FlightLog) -> str:
 
 
 def shrink_lens(camera: CameraParams) -> CameraParams:
-    """Return the lens on fewer pixels, on which the overlay's strokes are thicker."""
+    """Return the camera with fewer pixels, so that the overlay's lines are relatively thicker."""
     lens = camera.fisheye
     scale = PIXELS / max(lens.width, lens.height)
     size = {"width": round(scale * lens.width), "height": round(scale * lens.height)}
@@ -117,7 +117,7 @@ def shrink_lens(camera: CameraParams) -> CameraParams:
 
 
 def _bounds(log: FlightLog) -> Vector:
-    """Left, right and top of the side views [m]."""
+    """Return the left, right and upper bounds of the side views [m]."""
     times = log.meta["times"]
     paths = []
     for positions in (log["pos_w"], log["payload_pos_w"]):
@@ -165,7 +165,7 @@ def _side_view(axis, log: FlightLog, time: float, side: Vector, column: int) -> 
     axis.plot(path[carried, 0], path[carried, 2], **LOOKS["carried"])
     if np.count_nonzero(flown) > 1:
         axis.plot(path[flown, 0], path[flown, 2], **LOOKS["flown"])
-    if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
+    if log["cable_points_w"].time[-1] > time - 0.05:  # poses do not show a rope after separation
         rope = log["cable_points_w"].at(time)
         axis.plot(rope[:, 0], rope[:, 2], **LOOKS["rope"])
     _vehicle(axis, log, time, 1.0)
@@ -174,7 +174,7 @@ def _side_view(axis, log: FlightLog, time: float, side: Vector, column: int) -> 
 
 
 def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
-    """Arms and rotor discs as seen along y."""
+    """Draw arms and rotor discs as seen along y."""
     pos = log["pos_w"].at(time)
     rot = matrix_of_quat(log["quat_wb"].at(time)[None])[0]
     for foot in (ARM / np.sqrt(2.0), -ARM / np.sqrt(2.0)):
@@ -188,8 +188,8 @@ def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
 
 
 def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
-    """Keypoints of the true poses at a time, named in the first view; returns whether all are
-    visible.
+    """Draw the keypoints of the true poses at a time, with labels in the first view; return whether
+    all are visible.
     """
 
     def one(name: str) -> torch.Tensor:

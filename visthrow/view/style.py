@@ -1,6 +1,6 @@
-"""One style for all pictures: sizes, greys, and colours that colour-blind readers can distinguish.
+"""The common style of all pictures, with colours that colour-blind readers can distinguish.
 
-Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
+Source: Okabe and Ito, Color Universal Design, 2008, for the colours.
 """
 
 from collections.abc import Mapping
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Colours of compared things, in order."""
+"""Colours of series, in order."""
 
-MARKERS = ("o", "^", "s", "D", "v", "P")  # beside the colour, so that it never stands alone
+MARKERS = ("o", "^", "s", "D", "v", "P")  # of series, so that colour is not the only distinction
 
 INK = "#222222"
 QUIET = "#767676"
@@ -22,14 +22,14 @@ GOAL = "#009E73"
 FRONT = COLOURS[0]  # rotors
 REAR = "#9AA5B1"
 BEFORE = COLOURS[1]  # the plain model
-AFTER = COLOURS[0]  # the model with what a diagnosis named
+AFTER = COLOURS[0]  # the model with a diagnosis's effects
 
 
 def looks_of(tables: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return matplotlib's keywords for each part of a picture.
 
-    ``tables``: of each part; a colour may be the name of one of this module, ``ls`` a list of dash
-    and gap."""
+    ``tables``: table of each part, in which a colour may be a name in this module, and ``ls`` a
+    list with the lengths of dash and gap."""
     looks = {}
     for part, table in tables.items():
         look = dict(table)
@@ -42,7 +42,7 @@ def looks_of(tables: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def use() -> None:
-    """Set matplotlib to draw files in this style; call it before the first figure."""
+    """Configure matplotlib for files in this style; call it before the first figure."""
     import matplotlib.style
 
     matplotlib.use("Agg")
@@ -61,6 +61,6 @@ def subplots(rows: int, columns: int, size: tuple[float, float], **how: Any) -> 
 
 
 def single(size: tuple[float, float]) -> tuple[Any, Any]:
-    """Return a figure in this style with one axes, and these."""
+    """Return a figure in this style and its single axes; ``size``: width and height [inch]."""
     figure, axes = subplots(1, 1, size)
     return figure, axes[0, 0]

@@ -1,7 +1,4 @@
-"""Tables of throws:
-
-Markdown for people, CSV for programs. Every table says which plant it was measured on.
-"""
+"""Tables of throws: Markdown for people, CSV for programs. Every table names its plant."""
 
 import csv
 import io
@@ -19,10 +16,12 @@ PAPER = {
     for layout, rows in _TABLES["throws"].items()
     for target, figures in rows.items()
 }
-"""Layout and target [m] -> landing error [m] and duration [s], mean and deviation."""
+"""Layout and target [m] -> landing error [m] and duration [s], mean and standard deviation each."""
 
 PAPER_ABLATIONS = {name: tuple(figures) for name, figures in _TABLES["ablations"].items()}
-"""Variant -> landing error [m] and duration [s], mean and deviation, and where the throws land."""
+"""Variant -> landing error [m] and duration [s], mean and standard deviation each, and a
+description of the landing points.
+"""
 
 PAPER_FRONT: list[list[float]] = _TABLES["front"]
 """Release speed [m/s], w_t, rho, landing error [m], duration [s], position [m] and velocity error
@@ -42,14 +41,14 @@ HEADER = (
 
 
 def format_paper_result(name: str, target: float) -> str:
-    """Return the paper's error and duration, mean and deviation, as text; "-" without them."""
+    """Return the paper's error and duration as text, mean and standard deviation each, or "-"."""
     paper = PAPER.get((name, target))
     return "-" if paper is None else "{:.3f} ± {:.3f}, {:.3f} ± {:.3f}".format(*paper)
 
 
 def markdown(rows: Sequence[dict], title: str) -> str:
-    """Table of summaries, :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and
-    ``layout`` added.
+    """Return a Markdown table of :meth:`visthrow.task.measurement.Throws.summary` with ``policy``
+    and ``layout`` added.
     """
     return f"{title}\n\n{align(HEADER.split(' | '), [_cells(row) for row in rows], heads=1)}\n"
 
@@ -75,7 +74,7 @@ def _cells(row: dict) -> tuple[str, ...]:
 
 
 def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
-    """One row a throw, of policies' names, plants' names and
+    """Return CSV with one row for each throw; ``throws``: names of policy and plant, and
     :class:`visthrow.task.measurement.Throws`.
     """
     text = io.StringIO()

@@ -1,4 +1,4 @@
-"""Text from templates."""
+"""Render templates."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,13 +12,13 @@ def render(
     escape: bool = False,
     **values: Any,
 ) -> str:
-    """Return the text of a Jinja template with its values; a name that is missing is an error.
+    """Return the text of a Jinja template with values inserted; a missing name is an error.
 
     Args:
-        path: of the template.
-        filters: functions of the template, by name.
-        escape: whether values are put into HTML.
-        **values: names of the template and what they stand for.
+        path: file of the template.
+        filters: filter functions for the template, by name.
+        escape: whether to escape values for HTML.
+        **values: values of the template's names.
     """
     import jinja2
 
