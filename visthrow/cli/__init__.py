@@ -1,7 +1,7 @@
-"""The command line, a module a command; each is imported only when chosen, so that ``visthrow
---help`` answers at once.
+"""The command line. Each command has a module, which is imported only if the command is chosen, so
+that ``visthrow --help`` is fast.
 
-``hil`` and ``diagnose`` keep their own.
+``hil`` and ``diagnose`` have command lines of their own.
 """
 
 import argparse
@@ -30,8 +30,8 @@ COMMANDS: dict[str, tuple[str, str]] = _TABLES["commands"]
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
 GC_THRESHOLD = 50_000
-"""New objects that start a garbage collection: at Python's default of 700, collections take an
-eighth of the time in which a command is imported, and free nothing, as modules stay.
+"""Number of new objects that starts a garbage collection. At Python's default of 700, collections
+take an eighth of the import time of a command and free nothing, because modules stay.
 """
 
 _DESCRIPTION = """\
@@ -52,7 +52,7 @@ Set VISTHROW_TRACEBACK=1 to see where an error came from.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """Build the parser; only the chosen command's module is imported for its arguments."""
+    """Build the parser, which imports only the chosen command's module for its arguments."""
     form = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
         "visthrow", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=form
@@ -65,7 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    Returns the command's own status; 2 for a mistake of the user, stated in one message; 130 after
+    Returns the command's status; 2 for a mistake of the user, reported in one message; 130 after
     Ctrl-C."""
     gc.set_threshold(GC_THRESHOLD)
     try:
@@ -73,12 +73,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         complete(parser)
         args = parser.parse_args(argv)
         status = run_command(COMMANDS, args.command, args)
-        sys.stdout.flush()  # a reader that went away shows here, not when Python ends
+        sys.stdout.flush()  # raises BrokenPipeError here, not when Python ends
         return status
     except KeyboardInterrupt:
         print("visthrow: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # the reader of our output went away, as `head` does
+    except BrokenPipeError:  # the reader of our output has ended, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except ModuleNotFoundError as error:
@@ -107,8 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _find_hiding_file(error: ModuleNotFoundError) -> str | None:
-    """Return the file of another module that hides one of this project, such as a ``camera.py`` in
-    the working folder; None without one.
+    """Return the file of another module that shadows one of this project, such as a ``camera.py``
+    in the working folder; None if there is none.
     """
     name = (error.name or "").partition(".")[0]
     module = sys.modules.get(name)

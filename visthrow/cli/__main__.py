@@ -1,4 +1,4 @@
-"""``python -m visthrow.cli``."""
+"""Entry point of ``python -m visthrow.cli``."""
 
 import sys
 

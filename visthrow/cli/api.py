@@ -1,4 +1,4 @@
-"""The main commands from Python. Each option of a command is a keyword of its function.
+"""The main commands as Python functions. Each option of a command is a keyword of its function.
 
 ``visthrow train laptop --minutes 5 --set rope.length=0.4`` is
 ``visthrow.train("laptop", minutes=5, set={"rope.length": 0.4})``. Names, defaults and errors are
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from visthrow.onboard.policy import Policy
 
 REPEATED = ("set", "allow", "export")
-"""Options that take one value each time they are given."""
+"""Options that may be repeated, with one value each."""
 
 
 def train(config: str | Path, *, out: str | Path, **options: Any) -> "Policy":
@@ -38,12 +38,12 @@ def fly(
 
 
 def compare(*policies: str | Path, **options: Any) -> dict[str, Any]:
-    """Throw many times with each policy and return what ``--json`` writes."""
+    """Throw many times with each policy and return the figures of ``--json``."""
     return _run_json("compare", list(policies), options)
 
 
 def diagnose(*logs: str | Path, **options: Any) -> dict[str, Any]:
-    """Explain what the simulation gets wrong about flights and return what ``--json`` writes."""
+    """Find the effects that explain flights and return the figures of ``--json``."""
     return _run_json("diagnose", ["explain", *logs], options)
 
 
@@ -59,7 +59,7 @@ def _run_json(command: str, words: list[Any], options: Mapping[str, Any]) -> dic
 def _run(command: str, words: list[Any], options: Mapping[str, Any]) -> int:
     """Run a command of the command line and return its status.
 
-    Raises VisthrowError for a mistake that the command names, for an unknown option too."""
+    Raises VisthrowError: the command reports a mistake, or an option is unknown."""
     from visthrow import cli
     from visthrow.common.arguments import run_command
     from visthrow.common.errors import VisthrowError
@@ -75,7 +75,7 @@ def _run(command: str, words: list[Any], options: Mapping[str, Any]) -> int:
 
 
 def _words(option: str, value: Any, repeated: bool) -> list[str]:
-    """Return the words of one option; a flag is True, and False or None leaves it out."""
+    """Return the words of one option. True is a flag; False or None omits the option."""
     if value is None or value is False:
         return []
     if value is True:

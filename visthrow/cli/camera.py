@@ -1,4 +1,4 @@
-"""Arguments of ``visthrow camera``. What an action needs is imported when it is chosen."""
+"""Arguments of ``visthrow camera``. An action's modules are imported only if it is chosen."""
 
 import argparse
 

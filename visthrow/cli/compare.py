@@ -18,20 +18,20 @@ from visthrow.common.workers import status
 from visthrow.onboard.shipped import find_policy
 from visthrow.task.measurement import Entry
 
-BASELINE = "baseline"  # trajectory optimisation and MPC, beside the policies
+BASELINE = "baseline"  # name of trajectory optimisation and MPC among the policies
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Throws of several policies: a table, and a picture of where they landed."""
+    """Throws of several policies, with a table and a picture of the landing points."""
 
-    plant: str  # in the names of files; "runs" for throws of HIL runs
+    plant: str  # used in file names; "runs" for throws of HIL runs
     title: str
-    subtitle: str  # of the picture
+    subtitle: str  # part of the picture's title
     entries: Sequence[Entry]
-    note: str = ""  # on the paper's figures; empty for the usual one
+    note: str = ""  # note on the paper's figures; empty for the default one
 
     def table(self) -> str:
         """Return the table under its title, as Markdown."""
@@ -46,7 +46,7 @@ class Comparison:
         return f"{self.table()}\n{self.note or PAPER_NOTE}\n"
 
     def write(self, folder: Path) -> list[Path]:
-        """Write Markdown, CSV and scatter plot; returns their paths."""
+        """Write Markdown, CSV and scatter plot; return their paths."""
         from visthrow.view import figures, tables
 
         paths = [folder / f"compare-{self.plant}.{ending}" for ending in ("md", "csv", "png")]
@@ -63,7 +63,7 @@ class Comparison:
 
 
 def _landings(entry: Entry, throws: Any) -> tuple[str, np.ndarray]:
-    """Return a policy's name and where its throws landed, from the target [m], shape (N, 2)."""
+    """Return a policy's name and its landing points relative to the target [m], shape (N, 2)."""
     return entry.name, throws.landing_w[throws.success] - (throws.target, 0.0)
 
 
@@ -71,7 +71,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Throw, print, write."""
+    """Throw with each policy, print the table and write the files."""
     plant = args.plant
     if args.runs:
         return _compare_runs(args)
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         if name != BASELINE
     ]
     writable(Path(args.out))
-    if BASELINE in names:  # an error comes before the policies throw
+    if BASELINE in names:  # report an error before the policies throw
         rival = load_extra(
             "visthrow.paper.baseline.rival", "paper", f"the policy '{BASELINE}'", ConfigError
         )
@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str, Any]) -> int:
-    """Print and write a comparison; ``figures``: entries of its JSON beside the rows."""
+    """Print and write a comparison; ``figures``: further entries of its JSON besides the rows."""
     print(comparison.text())
     for path in comparison.write(Path(args.out)):
         print(path)
@@ -136,8 +136,9 @@ def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str
 
 
 def _compare_runs(args: argparse.Namespace) -> int:
-    """Print and write the table of the throws in folders of HIL runs; ConfigError where policies
-    were named as well.
+    """Print and write the table of the throws in folders of HIL runs.
+
+    Raises ConfigError: policies are named as well.
     """
     from visthrow.throws import from_runs
 
@@ -157,13 +158,13 @@ def _compare_runs(args: argparse.Namespace) -> int:
 
 
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
-    """Entries of learnt policies."""
+    """Return the entries of learnt policies."""
     layouts = (item.policy.contract["observation"]["layout"] for item in loaded)
     return [Entry(*parts) for parts in zip(names, layouts, throws)]
 
 
 def check(targets: Sequence[float]) -> None:
-    """Raise ConfigError for a target that is named twice."""
+    """Raise ConfigError if a target is given twice."""
     if len(set(targets)) < len(targets):
         raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
 
@@ -176,12 +177,12 @@ def throw_hybrid(
     seed: int,
     calibrate: bool = False,
 ) -> list[list]:
-    """Throw in the training simulator, after a calibration in the hover where configured; for each
-    policy a `Throws` per target.
+    """Throw in the training simulator, after a calibration in hover if ``calibrate`` is set; return
+    for each policy one `Throws` for each target.
     """
     from visthrow.throws.calibrated import start_calibrated
 
-    # A policy that cannot be calibrated is refused before the simulator is imported.
+    # refuse a policy that cannot be calibrated before the simulator is imported
     starts = [start_calibrated(item.experiment) if calibrate else None for item in loaded]
     from visthrow.training.env import ThrowEnv
     from visthrow.training.protocol import throw
@@ -204,7 +205,7 @@ def throw_hybrid(
 
 
 def label_throws(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
-    """Return throws on a plant under a title; ``notes`` are appended to it."""
+    """Return a comparison of throws on a plant with its title, to which ``notes`` are appended."""
     from visthrow.throws.plants import PLANTS
 
     short, long = PLANTS[plant]
@@ -214,7 +215,7 @@ def label_throws(plant: str, seed: int, entries: Sequence[Entry], notes: str = "
 
 
 def rows_of(entries: Sequence[Entry]) -> list[dict]:
-    """Summaries, target after target, throwers side by side; none of a target without throws."""
+    """Return summaries of the throws, ordered by target and then by entry; omit empty ones."""
     columns = zip(*(entry.throws for entry in entries))
     rows = [
         {"policy": entry.name, "layout": entry.layout, **row.summary()}

@@ -10,7 +10,7 @@ from visthrow.cli import compare, fly
 from visthrow.common.arguments import declare
 from visthrow.common.storage import writable
 
-# on the reference plant, for each policy; one such throw costs seconds
+# largest number of throws on the reference plant for each policy; one throw takes seconds
 REFERENCE_THROWS = 6
 REFERENCE_TARGETS = (2.0,)  # [m]
 
@@ -21,7 +21,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly, compare, list the files."""
+    """Fly one throw, compare the policies and list the files."""
     import importlib.util
 
     from visthrow.throws.loading import load_policy
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         from visthrow.throws.reference_protocol import Throwing
 
-        # The reference plant flies in a separate process meanwhile.
+        # the throws on the reference plant run in a separate process at the same time
         throws = (loaded, REFERENCE_TARGETS, count, "reference-realistic", SEED, 1)
         with Throwing(*throws, together=True) as throwing:
             paths = _throw_here(loaded, folder, args.throws)
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
-    """One recorded throw, and many in the training simulator."""
+    """Record one throw and compare many in the training simulator; return the files' paths."""
     from visthrow.throws.recorded import fly as throw_once
 
     print(
@@ -79,7 +79,7 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
 
 
 def _write_table(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
-    """Print the table and write it with its plot."""
+    """Print the table and write it with its plot; return the files' paths."""
     entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
     comparison = compare.label_throws(plant, SEED, entries)
     print(comparison.table(), flush=True)

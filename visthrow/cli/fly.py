@@ -22,7 +22,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly, write, tell."""
+    """Fly one throw, write the files and print a summary."""
     save = args.save
     find_policy(args.policy)  # reports an unknown name before heavy imports
     from visthrow.common.compute_device import resolve
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Raise ConfigError for arguments that no flight follows."""
+    """Raise ConfigError for invalid or contradictory arguments."""
     from visthrow.logs.export import FORMATS
     from visthrow.throws.plants import check_plant
 
@@ -96,7 +96,7 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
-    """Fly without a rope; write the log and print where the vehicle ended."""
+    """Fly without a rope, write the log and print the vehicle's final position error."""
     from visthrow.common.compute_device import resolve
     from visthrow.throws.vehicle_alone import SECONDS, fly_alone
 
@@ -123,7 +123,7 @@ def _make_rendered_eyes(loaded, method: str, seed: int):
 
 
 def write(folder: Path, log, experiment) -> list[Path]:
-    """Write log, recording and, for a throw that landed, the picture; returns their paths."""
+    """Write log, recording and, for a throw that landed, the picture; return their paths."""
     from visthrow.view import rerun_view, strip
 
     paths = [folder / name for name in list(FILES)[:3]]
@@ -136,7 +136,7 @@ def write(folder: Path, log, experiment) -> list[Path]:
 
 
 def export(path: str, log, experiment) -> None:
-    """Write a flight for other programs, by the ending of the path."""
+    """Write a flight for other programs in the format of the path's ending."""
     from visthrow.logs import export as tables
     from visthrow.view import mcap_view
 

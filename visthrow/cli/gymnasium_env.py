@@ -1,7 +1,7 @@
-"""The throwing task for programs that read Gymnasium: one throw, or a batch of throws.
+"""The throwing task as Gymnasium environments: one throw, or a batch of throws.
 
-Both wrap :class:`visthrow.training.env.ThrowEnv`. Observations are the actor's, rewards are those
-of training. An episode ends by its release or by a crash, never by truncation.
+Both wrap :class:`visthrow.training.env.ThrowEnv`, with the actor's observations and the rewards of
+training. An episode ends with its release or a failure, never by truncation.
 """
 
 from typing import Any
@@ -21,8 +21,8 @@ from visthrow.training.env import ThrowEnv
 class ThrowVectorEnv(VectorEnv):
     """A batch of throws as a Gymnasium vector environment.
 
-    A finished episode starts anew within the same step. ``infos["final_info"]`` then holds the
-    landing error [m], the duration [s] and whether the payload was released, each of shape (E,).
+    A finished episode restarts within the same step. ``infos["final_info"]`` then holds the landing
+    error [m], the duration [s] and whether the payload was released, each of shape (E,).
     """
 
     def __init__(
@@ -36,10 +36,10 @@ class ThrowVectorEnv(VectorEnv):
         """Build the simulator.
 
         Args:
-            name, overrides: configuration, as :func:`visthrow.task.load_experiment` takes it.
+            name, overrides: configuration; see :func:`visthrow.task.load_experiment`.
             count: number of throws E.
             device: "cpu" or "cuda:0".
-            seed: of everything random; ``reset(seed=...)`` replaces it.
+            seed: seed of all random draws; ``reset(seed=...)`` replaces it.
         """
         self._experiment = load_experiment(name, overrides)
         self._device = device
@@ -59,7 +59,7 @@ class ThrowVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ndarray, dict[str, Any]]:
-        """Start all throws; with a seed, repeatably."""
+        """Start all throws, reproducibly if a seed is given."""
         super().reset(seed=seed)
         if seed is not None:
             self._build(seed)
@@ -90,7 +90,7 @@ class SingleThrowEnv(gymnasium.Env):
     metadata = {"render_modes": []}  # noqa: RUF012  Gymnasium reads a class attribute
 
     def __init__(self, name: str = "state", device: str = "cpu", overrides: tuple[str, ...] = ()):
-        """Build the simulator for one throw; arguments as for :class:`ThrowVectorEnv`."""
+        """Build the simulator for one throw; arguments: see :class:`ThrowVectorEnv`."""
         self._batch = ThrowVectorEnv(name, 1, device, 0, overrides)
         self.observation_space = self._batch.single_observation_space
         self.action_space = self._batch.single_action_space
@@ -98,7 +98,7 @@ class SingleThrowEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ndarray, dict[str, Any]]:
-        """Start a throw; with a seed, repeatably."""
+        """Start a throw, reproducibly if a seed is given."""
         super().reset(seed=seed)
         observations, infos = self._batch.reset(seed=seed)
         return observations[0], infos

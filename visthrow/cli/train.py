@@ -1,6 +1,4 @@
-"""``visthrow train``: train a policy, from scratch or from another, with progress, evaluation,
-checkpoints, resume.
-"""
+"""``visthrow train``: train a policy, from scratch or from another policy, or resume a training."""
 
 import argparse
 
@@ -10,7 +8,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train."""
+    """Train a policy."""
     from visthrow.training import session
 
     return session.run(args)

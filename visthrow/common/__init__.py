@@ -1,1 +1,1 @@
-"""What every room uses: errors, files, devices, statistics, provenance, one look for pictures."""
+"""Modules for all other packages: arguments, errors, files, devices, statistics, provenance."""

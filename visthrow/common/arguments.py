@@ -1,4 +1,4 @@
-"""Commands and the options that they share, exit statuses, and requests to stop."""
+"""Commands and their shared options, exit statuses, and requests to stop."""
 
 import argparse
 import contextlib
@@ -18,7 +18,8 @@ from visthrow.common.toml_text import tables_beside
 Commands = Mapping[str, tuple[str, str]]
 """Name -> (help, module).
 
-The module has ``add_arguments(parser)`` and ``run(args) -> int``; it is imported only when chosen.
+The module has ``add_arguments(parser)`` and ``run(args) -> int``. It is imported only if its
+command is chosen.
 """
 
 EXIT_BAD_INPUT = 2
@@ -28,7 +29,9 @@ EXIT_INTERRUPTED = 130
 def make_number_parser(
     kind: type, good: Callable[[float], bool], expected: str
 ) -> Callable[[str], float]:
-    """Return a parser of command-line numbers that refuses those which are not good."""
+    """Return a parser of numbers that refuses those for which ``good`` is false; ``expected``: a
+    description of valid numbers for the message.
+    """
 
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):
@@ -54,16 +57,18 @@ TYPES: Mapping[str, Callable[[str], Any]] = {
     "names": lambda text: text.split(","),
     "solver": "sim.solver={}".format,
 }
-"""Readers of words of the command line by their names in tables of arguments."""
+"""Name in tables of arguments -> parser of a word of the command line."""
 
 SHARED: Mapping[str, Mapping[str, Any]] = tables_beside(__file__, "data/arguments.toml")
-"""Options that several commands have: name -> argparse's keywords."""
+"""Shared option -> argparse's keywords."""
 
 
 def add_option(
     parser: argparse.ArgumentParser, name: str, shared: bool = False, **values: Any
 ) -> None:
-    """Add an argument; ``shared``: the one of this name in :data:`SHARED`, with changed values."""
+    """Add an argument; ``shared``: that of this name in :data:`SHARED`, with ``values``
+    replaced.
+    """
     if shared:
         values = {**SHARED[name], **values}
     reader = values.get("type")
@@ -75,8 +80,9 @@ def add_option(
 def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None:
     """Add the arguments, actions and defaults of a table of ``commands.toml``.
 
-    Its keys: ``epilog``, ``arguments`` (name -> keywords of :func:`add_option`), ``actions``
-    (name -> a table of the same form with ``help``), ``dest`` of the chosen action, ``defaults``.
+    Keys of the table: ``epilog``, ``arguments`` (name -> keywords of :func:`add_option`),
+    ``actions`` (name -> a table of the same form with ``help``), ``dest`` of the chosen action,
+    ``defaults``.
     """
     parser.epilog = table.get("epilog", parser.epilog)
     for name, values in table.get("arguments", {}).items():
@@ -92,8 +98,8 @@ def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None
 
 
 def declare(*modules: str) -> Callable[[argparse.ArgumentParser], None]:
-    """Return a command's ``add_arguments``: of each module its table in the ``commands.toml``
-    beside it, named as that is.
+    """Return a command's ``add_arguments``, which adds the table of each module: the table with the
+    module's name in ``commands.toml`` in its folder.
     """
     tables = [tables_beside(module, "commands.toml")[Path(module).stem] for module in modules]
 
@@ -107,7 +113,7 @@ def declare(*modules: str) -> Callable[[argparse.ArgumentParser], None]:
 def add_commands(
     parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any
 ) -> None:
-    """Add commands, of which one must be chosen; its name goes to ``args.<dest>``."""
+    """Add commands, one of which is required; its name is stored in ``args.<dest>``."""
     choices = parser.add_subparsers(
         dest=dest, metavar=dest.upper(), required=True, parser_class=_Lazy, **group
     )
@@ -120,9 +126,9 @@ def add_commands(
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer a shell that asks for completions and exit; return at once where none asks.
+    """Print completions and exit if a shell requests them; otherwise return at once.
 
-    The words of the line choose the commands whose arguments are loaded.
+    Arguments are loaded only for the commands on the line.
     """
     line = os.environ.get("COMP_LINE")
     if "_ARGCOMPLETE" not in os.environ or line is None:
@@ -140,9 +146,9 @@ def complete(parser: argparse.ArgumentParser) -> None:
 
 
 def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
-    """Run the chosen command; returns its exit status.
+    """Run the chosen command and return its exit status.
 
-    Raises StorageError where ``--json`` could not be written, before the work.
+    Raises StorageError: the file of ``--json`` cannot be written; checked before the work.
     """
     if getattr(args, "json", None):
         from visthrow.common.storage import check_place
@@ -152,7 +158,7 @@ def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
 
 
 class _Lazy(argparse.ArgumentParser):
-    """Asks its module for the arguments only when it is the chosen one."""
+    """A parser that loads its module's arguments only if its command is chosen."""
 
     def __init__(self, *args: Any, module: str | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
@@ -168,7 +174,7 @@ class _Lazy(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self.add_module_arguments()
         namespace_out, unknown = super().parse_known_args(args, namespace)
-        # else the command's own parser would say it, without its options
+        # otherwise the main parser would report them, without this command's options
         if unknown and self._subparsers is None:
             options = [option for option in self._option_string_actions if option.startswith("--")]
             if unknown[0].startswith("-"):
@@ -180,14 +186,14 @@ class _Lazy(argparse.ArgumentParser):
 
 
 class StopRequest:
-    """Signals taken down, ``asked``, while it is entered, so that no piece of work is cut in two; a
-    second one interrupts.
+    """A context manager that records a signal in ``asked`` instead of interrupting a piece of work;
+    a second signal raises KeyboardInterrupt.
 
-    An interrupt that is raised anywhere is lost where it meets a destructor: Python prints it and
-    goes on. Threads beside the main one hear no signals."""
+    A KeyboardInterrupt inside a destructor would be lost: Python prints it and continues. Threads
+    other than the main one receive no signals."""
 
     def __init__(self, signals: Sequence[int], message: str = ""):
-        """Begin; ``message``: what the first one is answered on the terminal."""
+        """Prepare for these signals; ``message``: printed on the first one."""
         self.asked = False
         self._said = message
         self._signals = signals if threading.current_thread() is threading.main_thread() else ()

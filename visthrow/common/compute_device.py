@@ -1,4 +1,4 @@
-"""Choice of the compute device, and how exact its products are."""
+"""Choose the compute device and the precision of its products."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,10 +7,10 @@ from visthrow.common.errors import DeviceError
 
 
 def resolve(name: str = "auto") -> str:
-    """Turn ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` into ``cpu``
-    or ``cuda:<i>``, a device that torch can use.
+    """Resolve ``auto`` (a CUDA device if there is one), ``cpu``, ``cuda`` or ``cuda:<i>`` to
+    ``cpu`` or ``cuda:<i>``, a device that torch can use.
 
-    Raises DeviceError if there is no such device.
+    Raises DeviceError: there is no such device.
     """
     import torch
 
@@ -20,8 +20,8 @@ def resolve(name: str = "auto") -> str:
 def resolve_for_warp(name: str = "auto") -> str:
     """Resolve a name as :func:`resolve` does, to a device that Warp can use.
 
-    For what only simulates: it does not load torch, which takes seconds. Raises DeviceError if
-    there is no such device."""
+    It does not load torch, which takes seconds, for commands that only simulate. Raises
+    DeviceError: there is no such device."""
     import warp as wp
 
     from camera.warp_start import start
@@ -40,10 +40,10 @@ def _choose_device(name: str, count: int) -> str:
 
 @contextmanager
 def rounded_products(allowed: bool) -> Iterator[None]:
-    """Allow or forbid TF32's ten bits in float32 products on a GPU while the context lasts:
-    networks tolerate them, rays of keypoints do not.
+    """Allow or forbid TF32, with a mantissa of ten bits, for float32 products on a GPU in a
+    context: it suffices for networks but not for rays of keypoints.
 
-    A CUDA graph keeps what held when it was captured.
+    A CUDA graph keeps the setting under which it was captured.
     """
     import torch
 

@@ -1,20 +1,20 @@
-"""Errors that a user can cause and mend: one base class, one child a kind of mistake.
+"""Errors that a user can cause and correct: a base class, and a subclass for each kind of mistake.
 
-Every message says what came, what was expected and what exists. The command line prints the message
-alone."""
+Every message states what came, what was expected and what exists. The command line prints only the
+message."""
 
 from collections.abc import Collection, Iterable
 from difflib import get_close_matches
 
 
 class VisthrowError(Exception):
-    """Base of all errors that name a user's mistake or a state of the machine that the user can
+    """Base of all errors that report a user's mistake or a state of the machine that the user can
     change.
     """
 
 
 class ConfigError(VisthrowError):
-    """A configuration file, an override or a name of a configuration is wrong."""
+    """A configuration file, an override or a name of a configuration is invalid."""
 
 
 class PolicyError(VisthrowError):
@@ -22,8 +22,8 @@ class PolicyError(VisthrowError):
 
 
 class MismatchError(PolicyError):
-    """A policy was trained under other conditions than those it is to be used in: dotted ``keys``
-    of its contract differ.
+    """A policy was trained under different conditions than the present ones; ``keys``: dotted keys
+    of its contract that differ.
     """
 
     def __init__(self, message: str, keys: tuple[str, ...] = ()) -> None:
@@ -36,19 +36,19 @@ class LogError(VisthrowError):
 
 
 class DiagnoseError(VisthrowError):
-    """A diagnosis cannot be made of what was given."""
+    """A diagnosis cannot be made from the given data."""
 
 
 class TrainError(VisthrowError):
-    """Training cannot start, go on or resume."""
+    """Training cannot start, continue or resume."""
 
 
 class CheckpointError(TrainError):
-    """A checkpoint is missing, cut short or of another run."""
+    """A checkpoint is missing, truncated or of another run."""
 
 
 class BusyError(VisthrowError):
-    """Another process is at the same work."""
+    """Another process is doing the same work."""
 
 
 class DeviceError(VisthrowError):
@@ -60,12 +60,11 @@ class StorageError(VisthrowError):
 
 
 LONG_LIST = 30
-"""Names beyond which those near to a misspelt one are listed in place of all."""
+"""Number of names above which only those similar to a misspelt one are listed."""
 
 
 def suggest(name: str, existing: Iterable[str]) -> str:
-    """Say what exists, and which of it is closest to a name that does not:
-
+    """Return a hint for an unknown name: the existing names and the most similar one, as in
     ``"did you mean 'mass'? Known: inertia, mass"``.
     """
     names = sorted(existing)
@@ -88,8 +87,8 @@ def suggest(name: str, existing: Iterable[str]) -> str:
 def expect_known(
     names: Iterable[str], existing: Collection[str], subject: str, error: type[VisthrowError]
 ) -> None:
-    """Raise ``error`` for the first unknown name; its message is ``subject``, with the name in
-    braces, and what exists.
+    """Raise ``error`` for the first unknown name; the message consists of ``subject``, with ``{}``
+    replaced by the name, and the hint of :func:`suggest`.
     """
     for name in names:
         if name not in existing:

@@ -1,4 +1,4 @@
-"""Packages that only some users need: imported where they are used."""
+"""Import optional packages where they are used."""
 
 import importlib
 from types import ModuleType
@@ -13,19 +13,19 @@ PACKAGES = {
     "skimage": "scikit-image",
     "warp": "warp-lang",
 }
-"""Packages by the name that they are imported by, where the two differ."""
+"""Import name -> name of the package, if these differ."""
 
 
 def missing_package(error: ModuleNotFoundError) -> str:
-    """Return the name to install of the package that could not be imported."""
+    """Return the installation name of the package that could not be imported."""
     module = (error.name or "").partition(".")[0]
     return PACKAGES.get(module, module)
 
 
 def load_extra(module: str, extra: str, what: str, error: type[VisthrowError]) -> ModuleType:
-    """Import a module that needs an optional extra, for ``what``.
+    """Import a module that needs an optional extra.
 
-    Raises VisthrowError: of the type ``error``: a package is not installed; the message names it
+    Raises ``error``: a package is not installed; the message names ``what`` needs it, the package
     and the extra.
     """
     try:

@@ -1,4 +1,4 @@
-"""Free fall without drag, for NumPy arrays and torch tensors alike."""
+"""Free fall without drag, for NumPy arrays and torch tensors."""
 
 from typing import Any
 
@@ -8,12 +8,13 @@ GRAVITY = 9.81  # acceleration of free fall [m/s^2]; a test holds it equal to th
 
 
 def fall_time(height: Any, climb: Any, floor: float = 0.0) -> Any:
-    """Return the time [s] until a body comes down to the ground.
+    """Return the time until a body reaches the ground [s].
 
     Args:
-        height: above the ground [m], an array or tensor of any shape.
+        height: height above the ground [m], an array or tensor of any shape.
         climb: upward velocity [m/s], same shape.
-        floor: least radicand [m^2/s^2]: below it the body never reaches the height of the ground.
+        floor: lower limit of the radicand [m^2/s^2], which is negative if the body never reaches
+            the height of the ground.
     """
     radicand = (climb * climb + 2.0 * GRAVITY * height).clip(floor)
     root = np.sqrt(radicand) if isinstance(radicand, np.ndarray | np.generic) else radicand.sqrt()
@@ -21,7 +22,7 @@ def fall_time(height: Any, climb: Any, floor: float = 0.0) -> Any:
 
 
 def free_flight(pos_w: Any, vel_w: Any, time: Any) -> Any:
-    """Return the position [m] of bodies, shape (..., 3), after a time [s], a number or of shape
+    """Return positions of bodies [m], shape (..., 3), after a time [s], a number or shape
     (..., 1).
     """
     path = pos_w + time * vel_w

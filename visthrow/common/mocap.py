@@ -1,4 +1,4 @@
-"""What motion capture adds to the truth: noise of positions and attitudes."""
+"""Noise of motion capture on positions and attitudes."""
 
 from collections.abc import Mapping
 
@@ -10,11 +10,11 @@ from visthrow.common.rotations import rotate_by_small_angles
 def add_mocap_noise(
     truth: Mapping[str, np.ndarray], noise: Mapping[str, float], rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
-    """Add noise to poses, ``pos_w`` and ``payload_pos_w`` [m], shape (N, 3), then ``quat_wb``,
-    xyzw, shape (N, 4), an N each.
+    """Return poses with noise: ``pos_w`` and ``payload_pos_w`` [m], shape (N, 3), and ``quat_wb``,
+    xyzw, shape (N, 4); N may differ between these.
 
-    The noise is the standard deviation of each, [m], and [rad] about each axis of the body; it is
-    drawn for one after the other."""
+    ``noise``: standard deviation of each [m], and about each body axis [rad]. The draws follow the
+    order of ``truth``."""
     samples = {}
     for name, values in truth.items():
         error = noise[name] * rng.standard_normal((len(values), 3))

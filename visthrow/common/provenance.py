@@ -1,6 +1,6 @@
-"""Where a result comes from: commit, package versions, command line, processor.
+"""Record the provenance of a result: commit, package versions, command line and processor.
 
-Never host names, users or paths.
+It never contains host names, users or paths.
 """
 
 import os
@@ -31,17 +31,17 @@ PACKAGES = (
     "scipy",
     "mujoco-core",
 )
-"""Distributions whose version can change a figure."""
+"""Distributions whose version can affect results."""
 
-# names the commit where a copy of the tree runs without its history (a cluster node, a container)
+# variable that states the commit of a copy without history (on a cluster node, in a container)
 COMMIT_VARIABLE = "VISTHROW_COMMIT"
 
 _FOLDERS = re.compile(r"(?<![\w.~-])(?:~|[A-Za-z]:)?[/\\](?:[^\s/\\=,;:]+[/\\])*")
 
 
 def commit() -> str:
-    """Return the commit of the checkout that runs, with ``-dirty`` where tracked files were
-    changed, else "unknown".
+    """Return the commit of the running checkout, with ``-dirty`` if tracked files were changed;
+    without a checkout :data:`COMMIT_VARIABLE`, or "unknown".
     """
     root = Path(__file__).resolve().parents[2]
     variable = os.environ.get(COMMIT_VARIABLE, "unknown")
@@ -57,9 +57,8 @@ def commit() -> str:
 
 
 def command() -> str:
-    """Return the command line as a shell takes it, with absolute folders left out:
-
-    ``visthrow train``, ``python -m bench.train``.
+    """Return the command line in shell syntax without absolute folders, such as
+    ``visthrow train`` or ``python -m bench.train``.
     """
     program, *words = (_FOLDERS.sub("", argument) for argument in sys.argv)
     module = getattr(sys.modules["__main__"], "__spec__", None)
@@ -71,8 +70,8 @@ def command() -> str:
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the installed version of each package that can change a figure; they are looked for
-    once, as a process that records many runs has the same packages in all of them.
+    """Return the installed version of each of :data:`PACKAGES`; cached, because a process may
+    record many runs.
     """
     versions = {"visthrow": __version__, "python": platform.python_version()}
     for name in PACKAGES:
@@ -84,7 +83,7 @@ def versions() -> dict[str, str]:
 
 
 def processors() -> dict[str, Any]:
-    """Return the CPU's model and core count, and the GPUs' models if torch was imported already."""
+    """Return the CPU's model and core count, and the GPUs' models if torch is already imported."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -98,7 +97,7 @@ def processors() -> dict[str, Any]:
 
 
 def collect() -> dict[str, Any]:
-    """Return all of it, with the time [UTC]."""
+    """Return the complete provenance with the time [UTC]."""
     return {
         "commit": commit(),
         "command": command(),
@@ -111,19 +110,19 @@ def collect() -> dict[str, Any]:
 def write_run_folder(
     folder: str | Path, config_text: str, *, resume: bool = False, **extra: Any
 ) -> dict[str, Any]:
-    """Write the resolved config, TOML, and the provenance with ``extra`` beside the results of a
-    run; returns that.
+    """Write the resolved config, TOML, and the provenance with ``extra`` into the folder of a run;
+    return the provenance.
 
-    Where a folder holds a run that is resumed, its config is left, and the provenance goes to the
-    next free ``provenance_<n>.json``. Raises StorageError if the folder holds a run already and
-    ``resume`` is not set, or cannot be written."""
+    If a run is resumed, its config is kept, and the provenance is written to the next free
+    ``provenance_<n>.json``. Raises StorageError: the folder holds a run and ``resume`` is not set,
+    or it cannot be written."""
     folder = Path(folder)
     config = folder / "config.toml"
     record = {**collect(), **extra}
     writable(folder)
     if not resume:
         try:
-            config.touch(exist_ok=False)  # of two that begin at once one succeeds
+            config.touch(exist_ok=False)  # if two runs start at once, only one succeeds
         except FileExistsError:
             check_free(folder)
     elif config.exists():
@@ -140,7 +139,7 @@ def write_run_folder(
 
 
 def check_free(folder: str | Path) -> None:
-    """Refuse a folder that holds a run with a StorageError."""
+    """Raise StorageError if a folder holds a run."""
     if (Path(folder) / "config.toml").exists():
         raise StorageError(f"{folder} holds a run already; name another with --out, or resume it")
 

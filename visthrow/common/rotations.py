@@ -2,8 +2,8 @@
 
 Onboard-safe.
 
-First arrays over any leading axes; then single quaternions and vectors in plain floats, which NumPy
-would handle ten times slower and which give the same bits for the same input."""
+The first functions work on arrays with any leading axes. The last ones work on single quaternions
+and vectors of floats, ten times faster than NumPy, with reproducible bits."""
 
 import math
 
@@ -18,20 +18,20 @@ _LAST = np.array([2, 0, 1])
 
 
 def cross(a: ndarray, b: ndarray) -> ndarray:
-    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
+    """Return the cross product over the last axis, many times faster than ``np.cross`` for a few
     vectors.
     """
     return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
 def normal_part(vector: ndarray, axis: ndarray) -> ndarray:
-    """Return the components of vectors normal to unit vectors, both of shape (..., 3)."""
+    """Return the components of vectors normal to unit axes, both of shape (..., 3)."""
     parallel = np.einsum("...i,...i->...", vector, axis)
     return vector - parallel[..., None] * axis
 
 
 def matrix_of_quat(quat: ndarray) -> ndarray:
-    """Return rotation matrices ``rot_wb``, shape (..., 3, 3), of quaternions of any length, shape
+    """Return rotation matrices ``rot_wb``, shape (..., 3, 3), of quaternions of any norm, shape
     (..., 4).
     """
     unit = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
@@ -66,14 +66,14 @@ def quat_of_matrix(rot: ndarray) -> ndarray:
 
 
 def quat_of_vector(vector: ndarray) -> ndarray:
-    """Return unit quaternions, shape (..., 4), of axes times angles [rad], shape (..., 3)."""
+    """Return the unit quaternions, shape (..., 4), of rotation vectors [rad], shape (..., 3)."""
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([0.5 * vector * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
 def vectors_between(first: ndarray, last: ndarray) -> ndarray:
-    """Return axes times angles, below half a turn [rad], shape (T, 3), from attitudes to others,
-    quaternions of any length, shape (T, 4).
+    """Return the rotation vectors, with angles below pi [rad], shape (T, 3), from first to last
+    attitudes, quaternions of any norm, shape (T, 4).
     """
     turn = np.stack(multiply(conjugate(first.T), last.T), -1)
     turn *= np.where(turn[:, 3:] < 0.0, -1.0, 1.0)
@@ -83,14 +83,15 @@ def vectors_between(first: ndarray, last: ndarray) -> ndarray:
 
 
 def tilt_deg(vector: ndarray) -> ndarray:
-    """Return the angles of vectors from up [deg]; shape (..., 3) to (...)."""
+    """Return the angles between vectors, shape (..., 3), and the upward vertical [deg], shape
+    (...).
+    """
     level = np.linalg.norm(vector[..., :2], axis=-1)
     return np.degrees(np.arctan2(level, vector[..., 2]))
 
 
 def rotate(quat: ndarray, vector: ndarray) -> ndarray:
-    """Turn vectors, shape (..., 3), by unit quaternions, shape (..., 4):
-
+    """Rotate vectors, shape (..., 3), by unit quaternions, shape (..., 4):
     ``v + 2 w q x v + q x (2 q x v)``.
     """
     axis = quat[..., :3]
@@ -100,20 +101,20 @@ def rotate(quat: ndarray, vector: ndarray) -> ndarray:
 
 
 def rotate_back(quat: ndarray, vector: ndarray) -> ndarray:
-    """Turn vectors, shape (..., 3), by the inverse of unit quaternions, shape (..., 4)."""
+    """Rotate vectors, shape (..., 3), by the inverses of unit quaternions, shape (..., 4)."""
     return rotate(quat * [-1.0, -1.0, -1.0, 1.0], vector)
 
 
 def continuous(quat: ndarray) -> ndarray:
-    """Return a series of quaternions, shape (T, 4), with signs under which neighbours
-    differ least.
+    """Return a series of quaternions, shape (T, 4), with signs for which neighbours differ
+    least.
     """
     signs = np.where(np.sum(quat[1:] * quat[:-1], axis=1) < 0.0, -1.0, 1.0)
     return quat * np.cumprod(np.append(1.0, signs))[:, None]
 
 
 def rotate_by_small_angles(quat: ndarray, angle: ndarray) -> ndarray:
-    """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape
+    """Return unit quaternions, shape (N, 4), rotated about body axes by small angles [rad], shape
     (N, 3).
     """
     x = quat[:, :3]
@@ -126,7 +127,7 @@ def rotate_by_small_angles(quat: ndarray, angle: ndarray) -> ndarray:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product of single quaternions: first b, then a."""
+    """Return the Hamilton product of two quaternions, the rotation by b and then by a."""
     ax, ay, az, aw = a
     bx, b_y, bz, bw = b
     return (
@@ -138,7 +139,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def turn_one(quat: Quaternion, rate_b: Vector, time: float) -> Quaternion:
-    """Return a single attitude after a short time [s] at body rates [rad/s]."""
+    """Return an attitude after a short time [s] at body rates [rad/s]."""
     half = 0.5 * time
     turn = multiply(quat, (*(half * r for r in rate_b), 1.0))
     norm = sum(x * x for x in turn) ** 0.5
@@ -146,18 +147,18 @@ def turn_one(quat: Quaternion, rate_b: Vector, time: float) -> Quaternion:
 
 
 def conjugate(quat: Quaternion) -> Quaternion:
-    """Return the inverse turn of a single unit quaternion."""
+    """Return the inverse of a unit quaternion."""
     x, y, z, w = quat
     return (-x, -y, -z, w)
 
 
 def plus(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
-    """Return ``a + factor b`` of single vectors."""
+    """Return ``a + factor b`` for two vectors."""
     return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2])
 
 
 def rotate_one(quat: Quaternion, vector: Vector) -> Vector:
-    """Turn a single vector by a unit quaternion: ``v + 2 q x (q x v + w v)``."""
+    """Rotate a vector by a unit quaternion: ``v + 2 q x (q x v + w v)``."""
     x, y, z, w = quat
     vx, vy, vz = vector
     tx = y * vz - z * vy + w * vx
@@ -171,12 +172,12 @@ def rotate_one(quat: Quaternion, vector: Vector) -> Vector:
 
 
 def cross_one(a: Vector, b: Vector) -> Vector:
-    """Cross product of two single vectors."""
+    """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def rotation_vector(quat: Quaternion) -> Vector:
-    """Axis times angle of a single unit quaternion, below half a turn [rad]."""
+    """Return the rotation vector of a unit quaternion, with an angle below pi [rad]."""
     x, y, z, w = quat
     if w < 0.0:
         x = -x
@@ -189,15 +190,17 @@ def rotation_vector(quat: Quaternion) -> Vector:
 
 
 def tilt_and_heading(quat: Quaternion) -> tuple[float, float]:
-    """Angle of body z from the vertical, and of body x's heading from world x [rad]; NaN of NaN."""
+    """Return the angle of body z from the vertical, and that of body x's heading from world x
+    [rad]; NaN for NaN.
+    """
     x, y, z, w = quat
-    # in this order min and max pass a NaN on
+    # in this order min and max propagate a NaN
     tilt = math.acos(max(min(1.0 - 2.0 * (x * x + y * y), 1.0), -1.0))
     return tilt, math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
 def quat_of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Quaternion of angles [rad], yaw first, then pitch, then roll."""
+    """Return the quaternion of Euler angles [rad]: yaw first, then pitch, then roll."""
     cr = math.cos(roll / 2)
     sr = math.sin(roll / 2)
     cp = math.cos(pitch / 2)

@@ -1,10 +1,10 @@
-"""Statistics of throws: hierarchical bootstrap, ratios, differences, bias against scatter.
+"""Statistics of throws: hierarchical bootstrap, ratios, differences, bias and scatter.
 
-NumPy alone.
+It needs only NumPy.
 
-Throws of one training run are not independent evidence about the recipe that trained it: another
-seed may throw otherwise. Where several runs are given, a bootstrap sample draws runs first and then
-throws within each (two levels); with one run the interval speaks of that run's throws alone.
+Throws of one training run are not independent evidence about a training procedure, because another
+seed may yield different throws. For several runs a bootstrap sample draws first runs and then
+throws within each (two levels). For one run the interval only describes this run's throws.
 
 Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13 (percentile) and 14
 (BCa); Davison and Hinkley, "Bootstrap Methods and their Application", 1997, sec. 3.8 (hierarchical
@@ -16,13 +16,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray
 
-# bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
+# number of bootstrap samples, for which the ends of a 95 % interval vary by a few per cent of its
+# width
 DRAWS = 4000
 
 LEVEL = 0.95
 
 Groups = Sequence[ndarray]
-"""One array of throws a training run, shape (N,) or (N, ...)."""
+"""One array of throws for each training run, shape (N,) or (N, ...)."""
 
 
 @dataclass(frozen=True)
@@ -37,15 +38,17 @@ class Interval:
         return self.low <= value <= self.high
 
     def text(self, digits: int = 3, sign: bool = False) -> str:
-        """``0.025 [0.023, 0.027]``."""
+        """Return the interval as text, such as ``0.025 [0.023, 0.027]``."""
         form = f"{{:{'+' if sign else ''}.{digits}f}}"
         return f"{form.format(self.value)} [{form.format(self.low)}, {form.format(self.high)}]"
 
 
 def _resample(groups: list[ndarray], rng: np.random.Generator, draws: int) -> ndarray:
-    """Means of bootstrap samples, shape (draws, ...): runs drawn first, then throws within each."""
+    """Return means of bootstrap samples, shape (draws, ...), which draw first runs and then throws
+    within each.
+    """
     count = len(groups)
-    # means of resampled throws, for each run as many independent ones as it can be drawn
+    # means of resampled throws; a run needs as many independent ones as it can be drawn
     by_run = []
     for group in groups:
         index = rng.integers(len(group), size=(draws * count, len(group)), dtype=np.int32)
@@ -62,7 +65,10 @@ def _resample(groups: list[ndarray], rng: np.random.Generator, draws: int) -> nd
 
 
 def _require_throws(groups: Groups | ndarray) -> list[ndarray]:
-    """List of runs that have throws; ValueError where there is nothing to average."""
+    """Return the runs that have throws.
+
+    Raises ValueError: no run has throws, or a number is not finite.
+    """
     listed = [groups] if isinstance(groups, ndarray) else list(groups)
     groups_with_data = [np.asarray(group, dtype=float) for group in listed if len(group)]
     if not groups_with_data or any(not np.all(np.isfinite(group)) for group in groups_with_data):
@@ -80,13 +86,16 @@ def _interval(value: float, samples: ndarray) -> Interval:
 
 
 def _mean(groups: list[ndarray]) -> ndarray:
-    """Mean of the runs' means: each run counts the same."""
+    """Return the mean of the runs' means, so that each run has the same weight."""
     return np.mean([group.mean(0) for group in groups], axis=0)
 
 
 def mean(groups: Groups | ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
-    """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so
-    many bootstrap samples.
+    """Return the mean over runs and throws with its interval.
+
+    Args:
+        groups: throws of each run, shape (N,), or one array for one run.
+        seed: seed of the bootstrap. draws: number of bootstrap samples.
     """
     groups_with_data = _require_throws(groups)
     samples = _resample(groups_with_data, np.random.default_rng(seed), draws)
@@ -94,7 +103,7 @@ def mean(groups: Groups | ndarray, seed: int = 0, draws: int = DRAWS) -> Interva
 
 
 def difference(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
-    """Mean of ``a`` minus mean of ``b``, independent throws."""
+    """Return the mean of ``a`` minus the mean of ``b``, for independent throws."""
     return _compare_both(np.subtract, a, b, draws)
 
 
@@ -109,24 +118,26 @@ def _compare_both(
 
 
 def compare_pairs(a: ndarray, b: ndarray) -> Interval:
-    """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a
-    failed throw are left out.
+    """Return the mean of ``a - b`` over pairs with the same vehicle, wind and initial state,
+    without pairs that include a failed throw.
 
-    Raises ValueError: no pair in which both landed.
+    Raises ValueError: there is no pair in which both landed.
     """
     differences = np.asarray(a, dtype=float) - np.asarray(b, dtype=float)
     return mean(differences[np.isfinite(differences)])
 
 
 def ratio(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
-    """Mean of ``a`` over mean of ``b``, independent throws; both positive."""
+    """Return the mean of ``a`` divided by the mean of ``b``, for independent throws; both must be
+    positive.
+    """
     return _compare_both(np.divide, a, b, draws)
 
 
 def correlation(x: ndarray, y: ndarray) -> Interval:
-    """Pearson's correlation of pairs with its interval over pairs.
+    """Return Pearson's correlation of pairs with its interval over pairs.
 
-    Raises ValueError: fewer than three pairs, or one side that never varies.
+    Raises ValueError: fewer than three pairs, or one side is constant.
     """
     x = np.asarray(x, dtype=float)
     y = np.asarray(y, dtype=float)
@@ -140,7 +151,7 @@ def correlation(x: ndarray, y: ndarray) -> Interval:
 
 
 def _pearson(x: ndarray, y: ndarray) -> ndarray:
-    """Row by row; NaN where a row of one side is constant."""
+    """Return the correlation of each row; NaN if a row of one side is constant."""
     x = x - x.mean(1, keepdims=True)
     y = y - y.mean(1, keepdims=True)
     norm = np.sqrt((x**2).sum(1) * (y**2).sum(1))
@@ -149,19 +160,18 @@ def _pearson(x: ndarray, y: ndarray) -> ndarray:
 
 @dataclass(frozen=True)
 class Bias:
-    """The mean landing place and the scatter about it."""
+    """The mean landing point relative to the target, and the scatter about it."""
 
-    along: Interval  # mean miss along the throw, positive past the target [m]
-    lateral: Interval  # to the left of it [m]
-    offset: float  # length of the mean miss [m]
+    along: Interval  # mean offset along the throw, positive beyond the target [m]
+    lateral: Interval  # mean offset to the left [m]
+    offset: float  # length of the mean offset [m]
     scatter: float  # root mean square distance from the mean landing point [m]
-    share: float  # of the mean square miss that the offset makes up [-]
+    share: float  # share of the mean offset in the mean square error [-]
 
     @property
     def direction(self) -> str:
-        """Return the direction of the miss, if the interval excludes zero:
-
-        "undershoots, lands left", or "no bias".
+        """Return the directions whose intervals exclude zero, such as "undershoots, left", or
+        "none that shows".
         """
         words = []
         if 0.0 not in self.along:
@@ -172,10 +182,8 @@ class Bias:
 
 
 def bias(groups: Groups | ndarray) -> Bias:
-    """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common
-    offset and scatter.
-
-    Mean square = offset squared + scatter squared.
+    """Split the landing errors of each run, shape (N, 2) [m], along the throw and to the left, into
+    a common offset and scatter: mean square = offset squared + scatter squared.
     """
     groups_with_data = _require_throws(groups)
     samples = _resample(groups_with_data, np.random.default_rng(0), DRAWS)

@@ -1,5 +1,5 @@
-"""Writing of results: whole files or none; and bounds on what a file may unpack to, looked at
-before it is read. Onboard-safe: standard library and numpy only.
+"""Write results as whole files or not at all, and limit the unpacked size of a file before it is
+read. Onboard-safe: standard library and numpy only.
 """
 
 import io
@@ -18,19 +18,19 @@ from numpy import ndarray
 
 from visthrow.common.errors import StorageError
 
-MOST_UNPACKED = 256 << 20  # bytes that any file may unpack to
-MOST_TIMES = 50  # times its own size that a larger one may; logs of numbers take 2 to 20
-PIECE = 1 << 20  # bytes that are unpacked in one go
-SAY_EVERY = 3.0  # between two words on a read [s]
+MOST_UNPACKED = 256 << 20  # unpacked size that is always allowed [bytes]
+MOST_TIMES = 50  # allowed ratio of unpacked to packed size of a larger file; logs have 2 to 20
+PIECE = 1 << 20  # size of the pieces that are unpacked [bytes]
+SAY_EVERY = 3.0  # time between progress messages [s]
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
-    """Write bytes, or text as UTF-8, so that the path always holds the old content or the whole new
-    one.
+    """Write bytes, or text as UTF-8, so that the path always holds either the old or the whole new
+    content.
 
-    The content goes to a temporary file beside it, is flushed to the disk, and takes the name in
-    one step; folders are made. Raises StorageError if the disk is full or the place cannot be
-    written; nothing half-written is left."""
+    The content is written to a temporary file in the same folder, flushed to the disk, and renamed
+    atomically; missing folders are created. Raises StorageError: the disk is full or the file
+    cannot be written; no partial file remains."""
     path = Path(path)
     data = content.encode("utf-8") if isinstance(content, str) else content
     temporary = None
@@ -44,7 +44,7 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.umask(mask := os.umask(0))
-        os.chmod(temporary, 0o644 & ~mask)  # mkstemp makes it readable for its owner alone
+        os.chmod(temporary, 0o644 & ~mask)  # mkstemp makes it readable only for its owner
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
@@ -58,8 +58,8 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
 
 
 def writable(folder: Path) -> None:
-    """Make the folder of the results now, so that no work is done for results that could not be
-    written; StorageError then.
+    """Create the folder for results before the work. Raises StorageError: it cannot be created or
+    written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -70,9 +70,7 @@ def writable(folder: Path) -> None:
 
 
 def check_place(path: str | Path) -> None:
-    """Raise StorageError, before the work, for a file that could not be written after it; makes
-    nothing.
-    """
+    """Raise StorageError if a file could not be written after the work; nothing is created."""
     path = Path(path)
     if path.is_dir():
         raise StorageError(f"cannot write {path}: it is a folder; expected a file")
@@ -85,15 +83,16 @@ def check_place(path: str | Path) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write a value as indented JSON, atomically; NaN and infinity become null, as JSON has
-    neither.
+    """Write a value as indented JSON, atomically; NaN and infinity, which JSON does not have,
+    become null.
     """
     atomic_write(path, json.dumps(_replace_nan(value), indent=2, allow_nan=False) + "\n")
 
 
 def savez(path: str | Path, arrays: dict[str, ndarray]) -> None:
-    """Write named arrays as a compressed ``.npz``, atomically and without pickle; ValueError if one
-    holds Python objects.
+    """Write named arrays as a compressed ``.npz``, atomically and without pickle.
+
+    Raises ValueError: an array holds Python objects.
     """
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
@@ -106,7 +105,7 @@ def savez(path: str | Path, arrays: dict[str, ndarray]) -> None:
 
 
 def require_room(path: str | Path, unpacked: int, error: type[Exception]) -> None:
-    """Raise ``error`` for a file that unpacks to so many bytes, or to more, where that is too much
+    """Raise ``error`` for a file that unpacks to at least ``unpacked`` bytes, if that is too much
     for its size.
     """
     size = Path(path).stat().st_size
@@ -119,8 +118,9 @@ def require_room(path: str | Path, unpacked: int, error: type[Exception]) -> Non
 
 
 def unpack(path: str | Path, open_: Callable[..., IO[bytes]], error: type[Exception]) -> bytes:
-    """Return what a packed file holds, once it has been unpacked and measured without keeping it;
-    raises ``error`` where it is too much, and what ``open_`` raises.
+    """Return the content of a packed file, after a first pass that only measures its unpacked size.
+
+    Raises ``error``: the size is too large; and the errors of ``open_``.
     """
     with open_(path, "rb") as file:
         total = 0
@@ -132,7 +132,7 @@ def unpack(path: str | Path, open_: Callable[..., IO[bytes]], error: type[Except
 
 
 def count_lines(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
-    """Yield lines of a text of a length, and say on standard error how far that is."""
+    """Yield the lines of a text of ``length`` characters and report progress on standard error."""
     begin = time.monotonic()
     done = 0
     for line in lines:
@@ -146,8 +146,8 @@ def count_lines(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
 def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
-    Raises Exception: of class ``error``: no such file, cut short, damaged, not what it should be,
-    or more of it than its size lets expect."""
+    Raises ``error``: the file does not exist, is truncated, damaged or no archive, or its unpacked
+    size is too large."""
     path = Path(path)
     if not path.is_file():
         if path.parent.is_dir():
@@ -164,9 +164,9 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, ndar
             return {name: archive[name] for name in archive.files}
     except error:
         raise
-    except Exception as cause:  # zipfile, zlib, numpy and the OS each have their own way to say it
+    except Exception as cause:  # zipfile, zlib, numpy and the OS raise different errors
         size = path.stat().st_size
-        # For what is no archive at all numpy recommends to unpickle it.
+        # for a file that is no archive, numpy recommends pickle
         why = "no .npz archive" if "pickle" in str(cause) else cause
         raise error(
             f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}"
@@ -174,14 +174,14 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, ndar
 
 
 def json_array(value: Any) -> ndarray:
-    """Pack a JSON-able value into an array of bytes, for storage in an ``.npz``."""
+    """Pack a value as JSON into an array of bytes, for storage in an ``.npz``."""
     return np.frombuffer(
         json.dumps(value, sort_keys=True, allow_nan=False).encode("utf-8"), dtype=np.uint8
     )
 
 
 def from_json_array(array: ndarray) -> Any:
-    """Undo ``json_array``; ValueError if the array holds no JSON."""
+    """Return the value of an array of ``json_array``. Raises ValueError: it holds no JSON."""
     return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
 
 

@@ -1,4 +1,4 @@
-"""Tables of modules, and nested dictionaries as TOML, which the standard library only reads."""
+"""Read TOML tables of modules, and write nested dictionaries as TOML."""
 
 import tomllib
 from pathlib import Path
@@ -6,17 +6,17 @@ from typing import Any
 
 
 def tables_beside(module: str, name: str = "") -> dict[str, Any]:
-    """Read the TOML file that stands beside a module, by its ``__file__``; of the module's own name
-    where none is given.
+    """Read a TOML file in the folder of a module, given by its ``__file__``; default the file with
+    the module's name.
     """
     path = Path(module).with_suffix(".toml")
     return tomllib.loads((path.parent / name if name else path).read_text(encoding="utf-8"))
 
 
 def dumps(tree: dict[str, Any]) -> str:
-    """Write a nested dictionary as TOML text that ``tomllib.loads`` reads back to equal values.
+    """Return a nested dictionary as TOML, which ``tomllib.loads`` reads back to equal values.
 
-    Raises ValueError for a value without a form in TOML, such as None."""
+    Raises ValueError: TOML cannot represent a value, such as None."""
     import tomlkit
 
     return tomlkit.dumps(tree)

@@ -1,7 +1,7 @@
-"""Parallel work: computations in separate processes.
+"""Run computations in separate processes.
 
-Results come as they are done. An error, Ctrl-C or leaving early ends the processes. To resume
-interrupted work, a caller saves each result and skips those that exist."""
+Results are yielded as they finish. The processes end after an error, on Ctrl-C, or when the context
+is left early. To resume interrupted work, a caller saves each result and skips existing ones."""
 
 import multiprocessing as mp
 import pickle
@@ -15,33 +15,33 @@ from typing import Any
 
 from visthrow.common.errors import VisthrowError
 
-LOOK = 0.5  # between two looks at the progress [s]
+LOOK = 0.5  # time between updates of the progress [s]
 
 
 def status(text: str) -> None:
-    """Show a text on the terminal's last line in place of the one before; nothing clears it, or
-    where there is no terminal.
+    """Replace the terminal's last line by a text; an empty text clears it. Without a terminal do
+    nothing.
     """
     if sys.stderr.isatty():
         print(f"\r{text:<78}", end="" if text else "\r", file=sys.stderr, flush=True)
 
 
 class Workers:
-    """Processes that begin their tasks at once, in order; a context manager that ends them when
-    left.
+    """Processes that start their tasks at once, in order; a context manager that ends them.
 
-    Iterating yields each task's place in the order and its result, as they are done.
+    Iterating yields the index and the result of each task as they finish.
     """
 
     def __init__(
         self, function: Callable[[Any], Any], tasks: Iterable[Any], processes: int, label: str = ""
     ):
-        """Start at most so many processes.
+        """Start the processes.
 
         Args:
-            function, tasks: importable by its name; it may call :func:`progress`; what it is called
-                with.
-            processes, label: of a line of progress on the terminal; empty for none.
+            function: function of a task, importable by its name; it may call :func:`progress`.
+            tasks: arguments of the function.
+            processes: largest number of processes.
+            label: label of a progress line on the terminal; empty for no line.
         """
         tasks = list(tasks)
         context = mp.get_context("spawn")
@@ -49,7 +49,7 @@ class Workers:
         self._running = {}
         self._taken = context.Value("i", 0)
         self._shares = context.Array("d", len(tasks), lock=False)
-        # here: multiprocessing's own pickler would send tensors as shared memory
+        # pickled here, as multiprocessing's pickler would send tensors as shared memory
         work = pickle.dumps((function, tasks))
         for _ in range(min(processes, len(tasks))):
             ours, theirs = context.Pipe(duplex=False)
@@ -101,8 +101,8 @@ class Workers:
 def done(
     function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1, label: str = ""
 ) -> Iterator[tuple[int, Any]]:
-    """Yield each task's place in the order and its result as they are done; in this process,
-    without the label, where one will do.
+    """Yield the index and the result of each task as they finish; a single process or task runs in
+    this process, without a progress line.
     """
     tasks = list(tasks)
     if processes <= 1 or len(tasks) <= 1:
@@ -117,13 +117,15 @@ _index = 0
 
 
 def progress(share: float) -> None:
-    """Say in a task which share of it is done; nothing outside of a worker."""
+    """Report the finished share of a task; outside a worker do nothing."""
     if _shares is not None:
         _shares[_index] = share
 
 
 def _serve(end: Any, work: bytes, taken: Any, shares: Any) -> None:
-    """Take tasks until none is left, then say so: (None, None); (None, error) after an error."""
+    """Run tasks and send (index, result) for each, then (None, None), or (None, error) after an
+    error.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     import torch
 

@@ -1,19 +1,20 @@
-"""Strict configuration: TOML files in, frozen dataclasses out.
+"""Strict configuration: load TOML files as frozen dataclasses.
 
-A file holds exactly the keys of its schema. Two things reach beyond the file:
+A file holds exactly the keys of its schema. It can refer to other files in two ways:
 
-- ``base = "other.toml"`` at its top: the other file's values lie under this file's, table by table.
-- A *string* where the schema wants a table is the path of a file that holds that table.
+- ``base = "other.toml"`` at its top: this file's values override those of the other file, table by
+  table.
+- A *string* in place of a table is the path of a file that holds this table.
 
-Both paths are looked up beside the file first, then under the configs folder, then among the
-shipped configs of the same kind: a copy of ``configs/train/vision.toml`` finds its ``base =
-"state.toml"`` wherever it lies. Overrides (``"vehicle.body.mass=0.25"``) come last. ``"none"``
-stands for None where a field is optional; ints pass for floats, bools never for numbers; NaN and
+Paths are looked up first in the folder of the file, then in the configs folder, then among the
+shipped configs of the same kind, so that a copy of ``configs/train/vision.toml`` finds its ``base =
+"state.toml"`` from any folder. Overrides (``"vehicle.body.mass=0.25"``) come last. ``"none"``
+stands for None in an optional field. An integer is a valid float; a bool is never a number. NaN and
 infinity are refused.
 
-Among like tables (``[effects.wind_x]``, ``[effects.wind_y]``) one may name a sibling: ``base =
-"wind_x"`` puts the sibling's values under the table's own. A field ``name`` of such tables is their
-heading."""
+Among tables of the same kind (``[effects.wind_x]``, ``[effects.wind_y]``) one may refer to another:
+with ``base = "wind_x"`` its own values override those of that table. A field ``name`` of such
+tables is their heading."""
 
 import dataclasses
 import tomllib
@@ -40,11 +41,12 @@ T = TypeVar("T")
 def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
     """Load a TOML file into a frozen dataclass.
 
-    Raises ConfigError if a file is missing or no TOML, a key is unknown or missing, or a value has
-    the wrong type; the message names file, key path, what came, what was expected and what exists.
+    Raises ConfigError: a file is missing or not valid TOML, a key is unknown or missing, or a value
+    has the wrong type. The message names file, key path, the value, what was expected and what
+    exists.
 
     Args:
-        schema: Dataclass that the file must fill.
+        schema: Dataclass to fill.
         path: The file.
         overrides: ``"a.b=3"``: key path and TOML value (a bare word is a string), applied in order
             after includes.
@@ -56,8 +58,8 @@ def load(schema: type[T], path: str | Path, overrides: Iterable[str] = ()) -> T:
 
 
 def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str = "(text)") -> T:
-    """Load TOML text, which messages call by a name, as :func:`load` does a file; includes are
-    looked up under the root.
+    """Load TOML text as :func:`load` does a file; ``name``: name of the text in messages. Paths are
+    looked up in the configs folder.
     """
     return _build(schema, _parse(schema, text, name, configs_root(), ()), overrides)
 
@@ -65,8 +67,8 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
 def load_dict(
     schema: type[T], values: dict[str, Any], overrides: Iterable[str] = (), name: str = "(values)"
 ) -> T:
-    """Build a config from nested dictionaries, such as :func:`to_dict` gives, which messages call
-    by a name, as :func:`loads` does from text.
+    """Build a config from nested dictionaries, as from :func:`to_dict`; otherwise like
+    :func:`loads`.
     """
     tree = _complete(schema, spell_none(values), name, configs_root(), ())
     return _build(schema, tree, overrides)
@@ -86,8 +88,9 @@ def _build(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
 
 
 def configs_root() -> Path:
-    """Return the folder of shipped configs: inside the installed package, else beside it in a
-    checkout; ConfigError without either.
+    """Return the folder of shipped configs, in the installed package or in a checkout.
+
+    Raises ConfigError: neither exists.
     """
     package = Path(__file__).resolve().parents[1]
     for root in (package / "configs", package.parent / "configs"):
@@ -102,8 +105,8 @@ def configs_root() -> Path:
 def find(kind: str, name: str | Path) -> Path:
     """Find a config by name (``find("vehicle", "paper")``) or by an explicit path.
 
-    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ... Raises ConfigError
-    if there is none; the message lists what exists."""
+    The kind is a folder of ``configs``: vehicle, rope, camera, task, train, ... Raises ConfigError:
+    there is no such config; the message lists the existing ones."""
     root = configs_root()
     text = str(name)
     if text.endswith(".toml") or "/" in text or "\\" in text:
@@ -127,11 +130,11 @@ def available(kind: str) -> list[str]:
 
 
 def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
-    """Turn a config into nested dictionaries of plain values (tuples become lists), for JSON, TOML
+    """Convert a config to nested dictionaries of plain values (tuples become lists), for JSON, TOML
     or a comparison.
 
-    ``defaults``: whether fields that hold their default are written too. TypeError if ``config`` is
-    no dataclass instance."""
+    ``defaults``: whether to include fields with default values. Raises TypeError: ``config`` is not
+    an instance of a dataclass."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         raise TypeError(f"got {config!r}; expected an instance of a dataclass")
     values = {f: getattr(config, f.name) for f in dataclasses.fields(config) if f.init}
@@ -143,7 +146,7 @@ def to_dict(config: Any, *, defaults: bool = True) -> dict[str, Any]:
 
 
 def dumps(config: Any) -> str:
-    """Write a config as TOML that loads back to an equal config."""
+    """Return a config as TOML that loads back to an equal config."""
     return toml_text.dumps(spell_none(to_dict(config)))
 
 
@@ -164,7 +167,7 @@ def _plain(value: Any, defaults: bool) -> Any:
 
 
 def spell_none(value: Any) -> Any:
-    """Return nested values with the word that stands for None in TOML in its place."""
+    """Return nested values with None replaced by the word that represents it in TOML."""
     if value is None:
         return NONE_WORD
     if isinstance(value, dict):
@@ -173,7 +176,7 @@ def spell_none(value: Any) -> Any:
 
 
 def _display_path(path: Path) -> str:
-    """Name a file as the user would: relative to where the command runs, if below it."""
+    """Return the path of a file, relative to the working folder if the file is in it."""
     resolved = path.resolve()
     cwd = Path.cwd()
     return str(resolved.relative_to(cwd)) if resolved.is_relative_to(cwd) else str(path)
@@ -210,10 +213,10 @@ def _parse(
 def _complete(
     schema: type, raw: dict[str, Any], name: str, folder: Path, stack: tuple[Path, ...]
 ) -> ConfigTable:
-    """Put parsed TOML on top of the file that it names as its base, with the files that it includes
-    in their places.
+    """Return parsed TOML with included files inserted, merged over the file that it names as its
+    base.
     """
-    # A schema may itself have a field called "base"; then the word is an ordinary key.
+    # if a schema has a field called "base", the word is an ordinary key
     base = raw.pop(BASE_KEY, None) if BASE_KEY not in _schema.hints(schema) else None
     tree = _schema.as_table(raw, name)
     _include(schema, tree, folder, stack, "")
@@ -227,7 +230,7 @@ def _complete(
 def _include(
     schema: type, tree: ConfigTable, folder: Path, stack: tuple[Path, ...], path: str
 ) -> None:
-    """Replace each string that stands where the schema wants a table by the file that it names."""
+    """Replace each string in place of a table by the content of the file that it names."""
     for key, annotation in _schema.hints(schema).items():
         table_type = dataclass_of(annotation)
         node = tree.items.get(key)
@@ -255,7 +258,7 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
         for kind in kinds or ("**",)
         for path in root.glob(f"{kind}/*.toml")
     }
-    # a name as the command line takes it
+    # a name without folder and ending, as the command line accepts it
     short = [candidate for candidate in sorted(shipped) if Path(candidate).stem == name]
     meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
     _schema.fail(
@@ -302,8 +305,8 @@ def _override(schema: type, tree: ConfigTable, override: str) -> None:
 
 
 def _names_file(node: Leaf | ConfigTable, annotation: Any) -> TypeGuard[Leaf]:
-    """Whether a string stands where a table is wanted, which is then the path of a file, unless it
-    is the word for None.
+    """Return whether a node in place of a table is a string and thus the path of a file, not the
+    word for None.
     """
     none = isinstance(node, Leaf) and node.value == NONE_WORD and _schema.is_union(annotation)
     return isinstance(node, Leaf) and isinstance(node.value, str) and not none

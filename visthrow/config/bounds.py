@@ -1,4 +1,4 @@
-"""Bounds of numbers in configurations; what lies outside is a `ConfigError`."""
+"""Bounds of numbers in configurations; a number outside raises `ConfigError`."""
 
 from camera.field_bounds import (
     Bound,
@@ -15,6 +15,6 @@ __all__ = ["Bound", "Bounded", "NotNegative", "NotNegativeVector", "Positive", "
 
 
 class Bounded(BoundedFields):
-    """Base of dataclasses whose annotations state bounds."""
+    """Base of dataclasses with bounds in their annotations."""
 
     error = ConfigError

@@ -1,9 +1,9 @@
 """The catalogue of effects: the files of ``configs/effects``, read once.
 
-Training and diagnosis both apply it, training to plants drawn from what a diagnosis left uncertain.
+Diagnosis uses it, and training, for plants drawn from a diagnosis's posterior.
 
-Its classes are those of :mod:`sim.effects.effect`, which is imported when the catalogue is first
-read: configurations are read on board too, where no simulator is installed."""
+Its classes are those of :mod:`sim.effects.effect`, which is imported only when the catalogue is
+read, because configurations are also loaded on board, where no simulator is installed."""
 
 from collections.abc import Iterable
 from functools import cache
@@ -14,9 +14,7 @@ from visthrow.common.errors import ConfigError, expect_known
 from visthrow.config import kinds
 
 FILES = ("thrust", "body", "air", "rope", "sensing", "camera", "numerics", "structure", "random")
-"""Files of ``configs/effects`` in the order of the catalogue, which is that of a diagnosis'
-columns.
-"""
+"""Files of ``configs/effects`` in the order of the catalogue and of a diagnosis's columns."""
 
 
 @cache
@@ -27,19 +25,20 @@ def _tables() -> tuple[Any, ...]:
 
 @cache
 def catalogue() -> dict[str, Any]:
-    """Return every effect, a ``SettingEffect``, by its name."""
+    """Return name -> effect, a ``SettingEffect``."""
     return {name: effect for table in _tables() for name, effect in table.effects.items()}
 
 
 @cache
 def random_effects() -> tuple[Any, ...]:
-    """Return what may differ from flight to flight, each a ``RandomEffect``."""
+    """Return the effects that may differ between flights, each a ``RandomEffect``."""
     return tuple(effect for table in _tables() for effect in table.random_effects.values())
 
 
 def choose_effects(names: Iterable[str]) -> dict[str, Any]:
-    """Return the effects of these names in the order of the catalogue; ConfigError for one that it
-    does not hold.
+    """Return the effects of these names in the order of the catalogue.
+
+    Raises ConfigError: the catalogue does not have an effect of this name.
     """
     names = list(names)
     effects = catalogue()

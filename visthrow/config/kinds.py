@@ -1,4 +1,4 @@
-"""Which schema each folder of configs, and each file that differs from its folder, is read with."""
+"""The schema of each folder of configs, and of each file that differs from its folder."""
 
 from pkgutil import resolve_name
 
@@ -13,8 +13,9 @@ KINDS = [key for key in SCHEMAS if "/" not in key]
 
 
 def schema_of(kind: str, name: str = "") -> type:
-    """Return the schema of a config, whose module is imported only now; ConfigError for a kind of
-    which none is known.
+    """Return the schema of a config and import its module only then.
+
+    Raises ConfigError: the kind is unknown.
     """
     target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
     if target is None:
@@ -23,8 +24,6 @@ def schema_of(kind: str, name: str = "") -> type:
 
 
 def kinds_of(schema: type) -> list[str]:
-    """Return the folders of configs whose files fill a schema: none for one that no shipped config
-    has.
-    """
+    """Return the folders of configs whose files have a schema; none if no shipped config has it."""
     target = f"{schema.__module__}:{schema.__name__}"
     return [key for key in KINDS if SCHEMAS[key] == target]

@@ -1,4 +1,4 @@
-"""Strict conversion of parsed TOML into frozen dataclasses, with the source of every value at hand
+"""Strict conversion of parsed TOML into frozen dataclasses, which keeps the source of every value
 for messages.
 """
 
@@ -12,8 +12,8 @@ from typing import Any, Literal, Union
 
 from visthrow.common.errors import ConfigError, suggest
 
-NONE_WORD = "none"  # TOML has no null: this string stands for None wherever a field is optional
-# names what lies under a file (another file) or under a table among like ones (a sibling)
+NONE_WORD = "none"  # represents None in optional fields, as TOML has no null
+# key of the base whose values a file or table overrides: another file, or a table of the same kind
 BASE_KEY = "base"
 
 
@@ -35,13 +35,13 @@ class ConfigTable:
 
 @cache
 def hints(schema: type) -> dict[str, Any]:
-    """Return the resolved annotation of each field of a dataclass that its constructor takes."""
+    """Return the resolved annotation of each field in a dataclass's constructor."""
     resolved = typing.get_type_hints(schema)
     return {f.name: resolved[f.name] for f in dataclasses.fields(schema) if f.init}
 
 
 def dataclass_of(annotation: Any) -> type | None:
-    """Return the dataclass that an annotation asks for (``X`` or ``X | None``), or None."""
+    """Return the dataclass X of an annotation ``X`` or ``X | None``; None for others."""
     if dataclasses.is_dataclass(annotation) and isinstance(annotation, type):
         return annotation
     options = typing.get_args(annotation) if is_union(annotation) else ()
@@ -50,19 +50,21 @@ def dataclass_of(annotation: Any) -> type | None:
 
 
 def dict_values(annotation: Any) -> Any:
-    """Return what the values of ``dict[str, X]`` or ``dict[str, X] | None`` are, else None."""
+    """Return the type X of an annotation ``dict[str, X]`` or ``dict[str, X] | None``; None for
+    others.
+    """
     options = typing.get_args(annotation) if is_union(annotation) else (annotation,)
     types = [typing.get_args(option)[1] for option in options if typing.get_origin(option) is dict]
     return types[0] if len(types) == 1 else None
 
 
 def is_union(annotation: Any) -> bool:
-    """Tell whether an annotation is a union, in either spelling."""
+    """Return whether an annotation is a union, in either spelling."""
     return typing.get_origin(annotation) in (Union, types.UnionType)
 
 
 def describe(annotation: Any) -> str:
-    """Name an annotation in words that a user of TOML understands."""
+    """Describe an annotation in words for a user of TOML."""
     if annotation is type(None):
         return f'"{NONE_WORD}"'
     if is_union(annotation):
@@ -91,10 +93,9 @@ def fail(source: str, path: str, problem: str) -> typing.NoReturn:
 
 
 def build(annotation: Any, node: Leaf | ConfigTable, path: str = "") -> Any:
-    """Convert one node of the parsed tree, at a dotted path, into the type that the schema asks
-    for.
+    """Convert a node of the parsed tree, at a dotted path, to the type of its annotation.
 
-    Raises ConfigError if anything is unknown, missing or of another type.
+    Raises ConfigError: a key is unknown or missing, or a value has a wrong type.
     """
     if is_union(annotation):
         return _build_union(annotation, node, path)
@@ -115,7 +116,7 @@ def build(annotation: Any, node: Leaf | ConfigTable, path: str = "") -> Any:
     if origin is tuple:
         return _build_tuple(annotation, node, path)
     if origin is Literal:
-        # True == 1: compare the type too, so that a bool never passes for a number.
+        # True == 1: compare the type too, so that a bool never counts as a number
         if not any(type(node.value) is type(arg) and node.value == arg for arg in args):
             _wrong_type(annotation, node, path)
         return node.value
@@ -163,8 +164,8 @@ def _build_dataclass(schema: type, node: Leaf | ConfigTable, path: str) -> Any:
 
 
 def _rows(annotation: Any, node: ConfigTable, path: str) -> dict[str, Leaf | ConfigTable]:
-    """Return like tables of one table, each on top of the sibling that it names as its base; a
-    field ``name`` is the heading.
+    """Return the tables of the same kind in a table, each merged over the table that it names as
+    its base; a field ``name`` is set to the heading.
     """
     schema = dataclass_of(annotation)
     if schema is None or BASE_KEY in hints(schema):
@@ -204,7 +205,7 @@ def _describe(node: Leaf | ConfigTable) -> str:
 
 
 def merge_tables(base: ConfigTable, override: ConfigTable) -> ConfigTable:
-    """Return one table with another's values on top of its own, table by table."""
+    """Return ``base`` with values replaced by those of ``override``, table by table."""
     combined = ConfigTable(override.source, dict(base.items))
     for key, item in override.items.items():
         below = combined.items.get(key)

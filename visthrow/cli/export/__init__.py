@@ -1,1 +1,1 @@
-"""Exports of a policy's network for other programs."""
+"""Export of a policy's network for other programs."""

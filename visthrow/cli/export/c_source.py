@@ -1,4 +1,4 @@
-"""Export of a policy to C99: one file, constants and one function, no heap, only ``math.h``."""
+"""Export a policy to C99: one file with constants and one function; no heap, only ``math.h``."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from visthrow.view.templates import render
 def write_c(policy: Policy, path: str | Path) -> None:
     """Write the policy's network as a C file, whole or not at all.
 
-    Raises PolicyError if the activation has no expression here."""
+    Raises PolicyError: the activation has no C expression."""
     estimator = policy.estimator
     encoder = []
     if estimator is not None:
@@ -33,7 +33,7 @@ def write_c(policy: Policy, path: str | Path) -> None:
 
 
 def _array(values: Tensor, name: str) -> str:
-    """Return a constant array of C; float32 survives the nine digits."""
+    """Return the definition of a constant array in C; nine digits represent a float32 exactly."""
     kind = "float" if values.is_floating_point() else "int"
     numbers = [str(v) if kind == "int" else f"{v:.9g}" for v in values.flatten().tolist()]
     if kind == "float":

@@ -1,4 +1,4 @@
-"""Export of a policy to ONNX by torch's exporter, in one file."""
+"""Export a policy to one ONNX file with torch's exporter."""
 
 import logging
 from pathlib import Path
@@ -39,7 +39,7 @@ def write_onnx(policy: Policy, path: str | Path) -> None:
     if policy.estimator is not None:
         inputs["memory"] = policy.begin(batch)
         outputs.append("next_memory")
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision aloud
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is missing
     program = torch.onnx.export(
         PolicyStep(policy).eval(),
         kwargs=inputs,

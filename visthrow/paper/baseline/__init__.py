@@ -1,8 +1,8 @@
-"""The model-based baseline: release by projectile motion, septic spline, nonlinear MPC on a
-pendulum (TO+MPC).
+"""The model-based baseline TO+MPC: release by projectile motion, septic spline, nonlinear MPC of a
+pendulum.
 
-The paper's Sec. IV-A. ``pendulum`` is the model, ``spline`` and ``plan`` make the plan, ``mpc``
-tracks it, ``fly`` flies it in its own model and on the plants, ``front`` has the settings of the
-sweep, ``thrower`` the throws as units of work."""
+Source: the paper, Sec. IV-A. ``pendulum_model`` is the model, ``spline`` and ``throw_plan`` plan,
+``mpc`` tracks the plan, ``fly_plan`` flies it in the model and on the plants, ``front`` holds the
+settings of the sweep, and ``thrower`` provides throws as units of work."""
 
-NAME = "baseline"  # what compare calls it beside the policies
+NAME = "baseline"  # its name among the policies of compare

@@ -1,11 +1,11 @@
-"""Flies planned throws: in the controller's own pendulum (idealised), and on the plants behind
+"""Fly planned throws in the controller's pendulum model (idealised), and on the plants of
 :mod:`visthrow.throws.plants`.
 
-The own model knows no delay, no noise, no lag of the release and no aerodynamics: what is flown
-there is an upper bound. On the plants the pendulum's state is put together from what the plant
-measures, payload velocity included, and smoothed by the model. To make up for delays the controller
-looks ahead by what it knows of them (measurement, command queue, motors) through its own model
-under the commands on their way, and trips the latch early by the release's lag."""
+The model has no delays, no noise, no lag of the release and no aerodynamics, so its throws are an
+upper bound. On the plants the pendulum's state is computed from the plant's measurements, including
+the payload's velocity, and filtered by the model. To compensate known delays (measurement, command
+queue, motors) the controller predicts the state through its model with the commands that have not
+yet taken effect, and it trips the latch early by the release's lag."""
 
 import math
 from dataclasses import dataclass
@@ -35,28 +35,28 @@ from visthrow.throws.flight_loop import (
 from visthrow.throws.plants import HybridPlant, Plant, Snapshot
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
 
-# Runge-Kutta steps of the flown pendulum in one control period; the controller predicts with one
+# Runge-Kutta steps of the simulated pendulum in one control period; the controller uses one
 FINE = 4
 
 
-SENT = 8  # commands on their way that the controller looks back at; more than any delay holds
+SENT = 8  # number of last commands for the prediction; more than any delay covers
 
 TRUST = np.repeat([0.2, 0.3, 0.15, 0.3, 0.5], [3, 3, 3, 3, 4])
-"""Share of a measurement in the estimate of payload position and velocity, cable direction and
-rate, and attitude.
+"""Filter gains of payload position and velocity, cable direction and rate, and attitude: the
+measurement's share in the estimate.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Flown(Throws):
-    """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
+    """Throws of one plan, scored like those of policies; the clearance is NaN in the model."""
 
-    # of the payload at separation against the planned release [m], shape (N,)
+    # payload's position error at separation, relative to the planned release [m], shape (N,)
     position_error: ndarray
-    velocity_error: ndarray  # the same [m/s], shape (N,)
+    velocity_error: ndarray  # payload's velocity error at separation [m/s], shape (N,)
     # root mean square distance of the payload from the path until the release [m], shape (N,)
     tracking: ndarray
-    step_times: ndarray  # of all steps of the controller [s], shape (K,)
+    step_times: ndarray  # computation times of all steps of the controller [s], shape (K,)
 
 
 def _results_of(
@@ -66,8 +66,8 @@ def _results_of(
     step_times: list[float],
     **columns: ndarray,
 ) -> Flown:
-    """Results of throws; ``separated``: position [m] and velocity [m/s] of the payloads at
-    separation.
+    """Return the results of throws; ``separated``: positions [m] and velocities [m/s] of the
+    payloads at separation.
     """
     pos_w, vel_w = separated
     columns["position_error"] = norm(pos_w - plan.release.pos_w, axis=1)
@@ -77,18 +77,18 @@ def _results_of(
 
 
 def _normalise(params: MPCParams, command: ndarray) -> ndarray:
-    """Commands (E, 4) as a policy puts them out."""
+    """Return commands (E, 4) normalised like a policy's actions."""
     throttle = np.sqrt(np.clip(command[:, :1], 0.0, params.max_thrust) / params.max_thrust)
     return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
 
 
 def random_starts(plan: ThrowPlan, count: int, seed: int) -> ndarray:
-    """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N,
-    16).
+    """Return random initial states in hover with the variation of ``configs/start/hover.toml``,
+    shape (N, 16).
 
-    What varies between throws: position and velocity of the payload, direction and rate of the
-    cable, attitude. The vehicle's mass, the cable's length and the battery, which vary in training
-    too, are the model's own here."""
+    Position and velocity of the payload, direction and rate of the cable, and attitude vary. The
+    vehicle's mass, the cable's length and the battery, which also vary in training, are those of
+    the model."""
     start = pilots_hover()
     rng = np.random.default_rng(seed)
 
@@ -106,10 +106,11 @@ def random_starts(plan: ThrowPlan, count: int, seed: int) -> ndarray:
 
 
 def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
-    """Fly a plan so many times in the pendulum that the controller believes in.
+    """Fly a plan ``count`` times in the controller's pendulum model.
 
-    A throw fails when the controller's programme is not solved, the cable slackens or the payload
-    falls short. The release comes at the plan's time, within a control period if need be."""
+    A throw fails if the controller's quadratic programme is not solved, the cable slackens or the
+    payload never reaches the landing height. The release is at the planned time, possibly within a
+    control period."""
     carry = plan.path.duration
     params = MPCParams()
     controller = MPC(plan.model, params)
@@ -158,8 +159,8 @@ def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
 
 
 def pendulum_state(snapshot: Snapshot, mount_b: ndarray) -> ndarray:
-    """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E,
-    16).
+    """Return the state of the pendulum from a plant's snapshot, with a straight cable from mount to
+    payload, shape (E, 16).
     """
     rot = matrix_of_quat(snapshot.quat_wb)
     arm = rot @ mount_b
@@ -183,14 +184,14 @@ class Delays:
 
     measurement: float = 0.0  # age of the measurement
     command: float = 0.0  # from a command to its effect
-    release: float = 0.0  # from the latch to separation
+    release: float = 0.0  # from latch to separation
 
 
 def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
-    """Known delays of a plant: mean age of measurements; command queue, set-point filter and
-    motors; release.
+    """Return the known delays of a plant to compensate: mean age of measurements; command queue,
+    set-point filter and motors; release.
 
-    ``compensation``: "none", as in the paper; "delay", all but the release's lag; "both".
+    ``compensation``: "none", as in the paper; "delay", all except the release's lag; "both".
     """
     vehicle = experiment.vehicle
     latency = experiment.task.observation.latency
@@ -212,10 +213,10 @@ def look_ahead(
     begin: float,
     end: float = 0.0,
 ) -> ndarray:
-    """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end``
-    [s] ago, each held for a period [s].
+    """Predict states, shape (E, 16), with the commands sent from ``begin`` to ``end`` [s] ago, each
+    held for a period [s].
 
-    ``sent``: commands given one period ago, two periods ago and so on, shape (K, E, 4).
+    ``sent``: commands sent one period ago, two periods ago and so on, shape (K, E, 4).
     """
     age = begin
     while age > end + 1e-9:
@@ -229,8 +230,8 @@ def look_ahead(
 def _start_plant(
     name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
 ) -> tuple[Plant, ndarray]:
-    """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
-    shape (3,).
+    """Return a plant in the initial states of the policies' throws, and its hover point [m], shape
+    (3,).
     """
     task = experiment.task
     start = pilots_hover()
@@ -244,16 +245,16 @@ def _start_plant(
 
 
 class Controllers(Pilots):
-    """MPC of E vehicles as the pilots of a flight: tracks a plan, and trips the latch at its time.
+    """MPCs as the pilots of E vehicles, which track a plan and trip the latch at the planned time.
 
-    Attributes: ``latch``, the period of the throw in which the latch trips, ``most`` periods of a
-    throw, ``times`` of all steps [s]."""
+    Attributes: ``latch``: period of the throw in which the latch trips. ``most``: largest number of
+    periods of a throw. ``times``: computation times of all steps [s]."""
 
     def __init__(
         self, plan: ThrowPlan, experiment: Experiment, period: float, delays: Delays, count: int
     ):
-        """Begin in hover, with the experiment's limits, mount and release; commands come each
-        period [s].
+        """Prepare the controllers for a start in hover, with the experiment's limits, mount and
+        release and a control period [s].
         """
         self.plan = plan
         self.delays = delays
@@ -274,8 +275,8 @@ class Controllers(Pilots):
         self._period = 0
 
     def decide(self, flight: Flight, snapshot: Snapshot, latched: ndarray) -> Decision:
-        """See `visthrow.throws.flight_loop.Pilots`; a vehicle whose programme has no solution has
-        failed, and is held.
+        """Decide as `visthrow.throws.flight_loop.Pilots`. If a vehicle's quadratic programme is not
+        solved, its throw has failed, and it hovers.
         """
         command = latched.copy()
         k = self._period
@@ -300,8 +301,8 @@ class Controllers(Pilots):
         )
 
     def _correct_estimate(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
-        """State now: the model's prediction from the period before, corrected by what
-        is measured.
+        """Return the estimated state: the model's prediction from the previous period, corrected by
+        the measurement.
         """
         measured = pendulum_state(snapshot, np.array(self.experiment.rope.mount))
         if self._estimate is None:
@@ -318,7 +319,7 @@ class Controllers(Pilots):
 
 
 class _Tracking(Scores):
-    """Scores, and how well payloads keep to the plan."""
+    """Scores with the tracking errors of the payloads."""
 
     def __init__(self, pilots: Controllers):
         super().__init__(pilots)
@@ -350,7 +351,7 @@ class _Tracking(Scores):
             )
 
     def collect_results(self, flight: Flight) -> Flown:
-        """Results of all throws."""
+        """Return the results of all throws."""
         columns = self.columns(flight)
         columns["tracking"] = np.sqrt(self._sum / np.maximum(self._due, 1))
         plan = self.pilots.plan
@@ -368,12 +369,13 @@ def fly_plant(
     batch: int = 0,
     device: str = "cpu",
 ) -> Flown:
-    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`, the delays made up for.
+    """Fly a plan on a plant of :data:`visthrow.throws.plants.PLANTS`, with these delays
+    compensated.
 
-    The throws are those that learnt policies meet with the same count and seed: in the training
-    simulator the same vehicles, ropes and starts as :func:`visthrow.training.protocol.throw`, on a
-    reference plant the same vehicles, winds and starts as batch ``batch`` of
-    :mod:`visthrow.throws.reference_protocol`, from hover under the hover controller."""
+    The conditions are those of policies with the same count and seed. In the training simulator
+    they are the vehicles, ropes and initial states of :func:`visthrow.training.protocol.throw`. On
+    a reference plant they are the vehicles, winds and initial states of batch ``batch`` of
+    :mod:`visthrow.throws.reference_protocol`, after a hover under the hover controller."""
     plant, home = _start_plant(plant_name, experiment, plan.target, batch, count, seed, device)
     pilots = Controllers(plan, experiment, plant.period, delays, count)
     flight = Flight(plant, pilots, tracking := _Tracking(pilots), home)

@@ -1,4 +1,4 @@
-"""Settings that trade agility for accuracy, and what a front is worth."""
+"""Settings of the sweep that trades agility for accuracy, and the hypervolume of its front."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3)
 """Duration and energy weights of the sweep; the last three are the paper's."""
 
 FRONT_TARGET = 2.0  # target of the sweep (the paper, Table IV) [m]
-FRONT_THROWS = 10  # throws of a setting, as in the paper
+FRONT_THROWS = 10  # throws for each setting, as in the paper
 
-CORNER = (2.5, 0.5)  # duration [s] and landing error [m] that hypervolumes are measured from
+CORNER = (2.5, 0.5)  # reference point of hypervolumes: duration [s] and landing error [m]
 
 
 def pareto(points: np.ndarray) -> np.ndarray:
-    """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
-    first coordinate.
+    """Return the indices of the Pareto front of points (N, 2), both coordinates minimised, ordered
+    by the first coordinate.
     """
     front = []
     best = np.inf
@@ -27,7 +27,9 @@ def pareto(points: np.ndarray) -> np.ndarray:
 
 
 def hypervolume(points: np.ndarray, corner: tuple[float, float] = CORNER) -> float:
-    """Area between points (N, 2), smaller is better, and a corner [s m]."""
+    """Return the area that points (N, 2), both coordinates minimised, dominate below a reference
+    point [s m].
+    """
     dominating = points[np.all(points < corner, axis=1)]
     front = dominating[pareto(dominating)]
     widths = np.diff(front[:, 0], append=corner[0])

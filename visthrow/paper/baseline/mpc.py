@@ -1,10 +1,10 @@
-"""Nonlinear model-predictive controller of the pendulum: one real-time iteration of SQP a control
-period.
+"""Nonlinear model-predictive controller of the pendulum, with one real-time iteration of SQP in
+each control period.
 
-Least squares over the horizon, on payload, cable, attitude and control effort (the paper, Sec.
-IV-A; weights are ours), under bounds on thrust and body rates. Each step linearises the model about
-the last solution moved on by one period, and solves one sparse quadratic programme with piqp's
-multistage factorisation.
+The cost is a sum of squares over the horizon, of errors of payload, cable, attitude and input (the
+paper, Sec. IV-A; weights are ours), with bounds on thrust and body rates. Each step linearises the
+model about the previous solution, shifted by one period, and solves a sparse quadratic programme
+with piqp's multistage factorisation.
 
 Source: Diehl, Bock, Schloeder, "A real-time iteration scheme for nonlinear optimization in optimal
 feedback control", SIAM J. Control Optim. 2005; Schwan, Jiang, Kuhn, Jones, "PIQP: A proximal
@@ -30,24 +30,24 @@ class SolverError(VisthrowError):
 
 @dataclass(frozen=True)
 class MPCParams:
-    """Horizon, scales of the errors (a weight is one over the square), and bounds."""
+    """Horizon, scales of the errors (a weight is the inverse square of a scale), and bounds."""
 
     period: float = 0.02  # [s]
-    stages: int = 62  # of one period: 1.24 s, the paper's 1.25 s in whole periods
+    stages: int = 62  # of one period each: 1.24 s, the paper's 1.25 s rounded to whole periods
     position: float = 0.045  # of the payload [m]
     velocity: float = 0.15  # of the payload [m/s]
     direction: float = 0.15  # of the cable [-]
     rate: float = 1.0  # of the cable [rad/s]
-    attitude: float = 0.3  # of the quaternion's parts [-]
-    thrust: float = 2.0  # off the feed-forward [N]
-    body_rate: float = 2.0  # off the feed-forward [rad/s]
+    attitude: float = 0.3  # of the quaternion's components [-]
+    thrust: float = 2.0  # deviation from the feed-forward [N]
+    body_rate: float = 2.0  # deviation from the feed-forward [rad/s]
     min_thrust: float = 0.2  # [N]
     max_thrust: float = 14.0  # [N]
     max_rate: tuple[float, float, float] = (10.0, 10.0, 4.0)  # [rad/s]
 
     @property
     def state_weights(self) -> ndarray:
-        """Shape (16,)."""
+        """Return the weights of the state's errors, shape (16,)."""
         scale = np.repeat(
             [self.position, self.velocity, self.direction, self.rate, self.attitude],
             [3, 3, 3, 3, 4],
@@ -56,17 +56,18 @@ class MPCParams:
 
     @property
     def input_weights(self) -> ndarray:
-        """Shape (4,)."""
+        """Return the weights of the input's errors, shape (4,)."""
         return np.array([self.thrust, *[self.body_rate] * 3]) ** -2.0
 
 
 class MPC:
-    """Controller of one vehicle."""
+    """The controller of one vehicle."""
 
     def __init__(self, model: Pendulum, params: MPCParams | None = None):
-        """Build the programme's pattern; it is factorised symbolically once.
+        """Build the sparsity pattern of the quadratic programme, which is factorised symbolically
+        once.
 
-        ModuleNotFoundError where piqp is not installed.
+        Raises ModuleNotFoundError: piqp is not installed.
         """
         import piqp
 
@@ -94,13 +95,13 @@ class MPC:
         self._set_up(np.zeros(size), np.zeros(self._matrix.shape[0]))
 
     def reset(self) -> None:
-        """Forget the last solution."""
+        """Discard the previous solution."""
         self._states = self._inputs = None
         self.step_time = 0.0
 
     def _rows_columns(self) -> None:
-        """Pattern of the constraints: stage k's rows hold -[A B] of stage k and 1 of stage k + 1;
-        the first rows x_0.
+        """Build the pattern of the constraints: the first rows fix x_0; the rows of stage k contain
+        -[A B] for stage k and the identity for stage k + 1.
         """
         n = self.params.stages
         eye = np.arange(STATES)
@@ -121,14 +122,14 @@ class MPC:
         self._matrix.data[:] = np.concatenate([np.ones(STATES), values])[self._order]
 
     def step(self, state: ndarray, reference: tuple[ndarray, ndarray]) -> ndarray:
-        """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming
-        period, shape (4,).
+        """Do one real-time iteration and return the command [N, rad/s] for the next period, shape
+        (4,).
 
-        Raises SolverError: the programme was not solved; the message carries the solver's status.
+        Raises SolverError: the programme was not solved; the message contains the solver's status.
 
         Args:
-            state: now.
-            reference: states (N + 1, 16) and inputs (N, 4) at the ends of the stages, from now on.
+            state: present state, shape (16,).
+            reference: states (N + 1, 16) at the boundaries of the stages, and their inputs (N, 4).
         """
         began = time.perf_counter()
         n = self.params.stages
@@ -175,15 +176,15 @@ class MPC:
         return np.asarray(self._solver.result.x)
 
     def _set_up(self, linear: ndarray, right: ndarray) -> None:
-        """Hand the whole programme over, with its pattern; after that only its numbers change."""
+        """Pass the whole programme with its pattern to the solver; later only numbers change."""
         low, high = self._bounds
         cost = sparse.diags(self._weights, format="csc")
         self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
         self._ready = True
 
     def _move_on(self, states: ndarray, inputs: ndarray) -> None:
-        """Keep the solution as of one period later, its last input held; directions and quaternions
-        back at unit length.
+        """Store the solution shifted by one period, with its last input repeated and directions and
+        quaternions normalised.
         """
         self._inputs = np.concatenate([inputs[1:], inputs[-1:]])
         self._states = np.concatenate(
@@ -194,7 +195,9 @@ class MPC:
 
 
 def _align_signs(target: ndarray, reference: ndarray) -> ndarray:
-    """Quaternions with the signs of others': q and -q are one attitude."""
+    """Return states whose quaternions have the signs of the reference's, as q and -q are the same
+    attitude.
+    """
     target = target.copy()
     sign = np.sign((target[:, QUAT] * reference[:, QUAT]).sum(1))
     target[:, QUAT] *= np.where(sign == 0.0, 1.0, sign)[:, None]

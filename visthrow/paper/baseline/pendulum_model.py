@@ -1,10 +1,10 @@
-"""The baseline's model: a point mass under a massless, taut, inextensible cable below a quadrotor
-that follows body rates.
+"""The baseline's model: a point mass on a massless, taut, inextensible cable below a quadrotor that
+follows body rates exactly.
 
-State of 16 numbers: payload position p and velocity v (world), cable direction q from vehicle to
-payload and its angular velocity w (world, at right angles to q), attitude quaternion (xyzw, body to
-world). Input of 4: collective thrust c [N] and body rates [rad/s]. With the masses M of the vehicle
-and m of the payload, cable length l, ``b`` the body's z axis:
+The state has 16 numbers: payload position p and velocity v (world), cable direction q from vehicle
+to payload and its angular velocity w (world, perpendicular to q), attitude quaternion (xyzw, body
+to world). The input has 4: collective thrust c [N] and body rates [rad/s]. With the masses M of the
+vehicle and m of the payload, the cable length l, and ``b`` the body's z axis:
 
 - ``p' = v``, ``(M + m) (v' + g e_z) = (q . c b - M l |w|^2) q``
 - ``q' = w x q``, ``M l w' = -q x c b``
@@ -12,7 +12,7 @@ and m of the payload, cable length l, ``b`` the body's z axis:
 
 Source: Sreenath, Lee, Kumar, "Geometric control and differential flatness of a quadrotor UAV with a
 cable-suspended load", CDC 2013, eqs. (5) to (8), with the attitude driven by commanded rates. The
-paper's baseline (Sec. IV-A) uses the same sixteen states; the equations are not printed there."""
+paper's baseline (Sec. IV-A) uses the same sixteen states but does not print the equations."""
 
 from dataclasses import dataclass
 
@@ -33,12 +33,12 @@ QUAT = slice(12, 16)
 _SUCCESSOR = [1, 2, 0]  # axes of a cross product
 _LAST = [2, 0, 1]
 
-_TINY = 1e-30  # complex step: so small that the derivative has no truncation error
+_TINY = 1e-30  # complex step, for which the derivative's truncation error is negligible
 
 
 @dataclass(frozen=True)
 class Pendulum:
-    """Masses [kg] and the length of the cable from its mount to the payload's centre [m]."""
+    """Masses [kg], and length of the cable from its mount to the payload's centre [m]."""
 
     vehicle_mass: float
     payload_mass: float
@@ -46,12 +46,12 @@ class Pendulum:
 
     @property
     def weight(self) -> float:
-        """Weight of both bodies [N]."""
+        """Return the weight of both bodies [N]."""
         return (self.vehicle_mass + self.payload_mass) * GRAVITY
 
 
 def pendulum_of(plant: PlantParams) -> Pendulum:
-    """Pendulum of a plant: half of the rope's mass at each of its ends, as in a finite element."""
+    """Return the pendulum of a plant, with half of the rope's mass at each end."""
     rope = plant.rope
     half = 0.5 * plant.rope.rope_mass
     return Pendulum(
@@ -60,8 +60,8 @@ def pendulum_of(plant: PlantParams) -> Pendulum:
 
 
 def derivative(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
-    """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4,
-    ...); complex numbers pass through.
+    """Return the time derivative of states, shape (16, ...), for thrust [N] and body rates [rad/s],
+    shape (4, ...); real or complex.
     """
     direction = state[DIR]
     rate = state[RATE]
@@ -86,13 +86,13 @@ def derivative(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
 
 
 def _cross(a: ndarray, b: ndarray) -> ndarray:
-    """Cross product of vectors, shape (3, ...) each."""
+    """Return the cross product of vectors, shape (3, ...) each."""
     return a[_SUCCESSOR] * b[_LAST] - a[_LAST] * b[_SUCCESSOR]
 
 
 def normalise(columns: ndarray) -> None:
-    """Bring direction and quaternion of states, shape (16, ...), to unit length and the cable's
-    rate across its direction, in place; written without conjugates for the complex step.
+    """Normalise direction and quaternion of states, shape (16, ...), and make the cable's rate
+    perpendicular to its direction, in place; without conjugates, for the complex step.
     """
     direction = columns[DIR]
     direction /= np.sqrt((direction * direction).sum(0))
@@ -101,7 +101,7 @@ def normalise(columns: ndarray) -> None:
 
 
 def _advance(model: Pendulum, state: ndarray, control: ndarray, period: float) -> ndarray:
-    """One step of the classical Runge-Kutta method, then :func:`normalise`."""
+    """Do one step of the classical Runge-Kutta method, then :func:`normalise`."""
     k1 = derivative(model, state, control)
     k2 = derivative(model, state + (0.5 * period) * k1, control)
     k3 = derivative(model, state + (0.5 * period) * k2, control)
@@ -114,8 +114,8 @@ def _advance(model: Pendulum, state: ndarray, control: ndarray, period: float) -
 def step(
     model: Pendulum, state: ndarray, control: ndarray, period: float, substeps: int = 1
 ) -> ndarray:
-    """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in
-    so many Runge-Kutta steps.
+    """Advance states, shape (..., 16), with constant inputs, shape (..., 4), over a period [s] in
+    ``substeps`` Runge-Kutta steps.
     """
     columns = np.moveaxis(state, -1, 0)
     inputs = np.moveaxis(control, -1, 0)
@@ -127,8 +127,8 @@ def step(
 def linearise(
     model: Pendulum, state: ndarray, control: ndarray, period: float
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex
-    steps, exact to rounding.
+    """Do one Runge-Kutta step of states (K, 16) with inputs (K, 4), and compute its Jacobians by
+    complex steps, exact to rounding.
 
     Returns next states (K, 16), Jacobians by state (K, 16, 16) and by input (K, 16, 4).
 
@@ -147,16 +147,14 @@ def linearise(
 
 
 def tension(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
-    """Cable force [N], shape (...); below 0 the model's taut cable would push, and the model does
-    not hold.
-    """
+    """Return the cable's tension [N], shape (...); the model is not valid where it is negative."""
     pull = derivative(model, np.moveaxis(state, -1, 0), np.moveaxis(control, -1, 0))[3:6].copy()
     pull[2] += GRAVITY
     return -model.payload_mass * (pull * np.moveaxis(state, -1, 0)[DIR]).sum(0)
 
 
 def hover(model: Pendulum, payload_w: ndarray) -> tuple[ndarray, ndarray]:
-    """State (..., 16) and input (..., 4) of hover with the payload at places [m], shape
+    """Return state (..., 16) and input (..., 4) of a hover with the payload at positions [m], shape
     (..., 3).
     """
     payload_w = np.asarray(payload_w, dtype=float)

@@ -1,4 +1,4 @@
-"""The baseline's throws for ``visthrow compare``, on the same targets as the policies'."""
+"""Throw with the baseline for ``visthrow compare``, at the policies' targets."""
 
 import argparse
 import tempfile
@@ -12,8 +12,8 @@ from visthrow.throws.reference_protocol import FIELDS
 
 
 def throw_baseline(args: argparse.Namespace) -> list[Entry]:
-    """Throw with trajectory optimisation and MPC: in its own model, and on the plant under each
-    compensation.
+    """Throw with trajectory optimisation and MPC, in the controller's model, and on the plant with
+    each compensation of delays.
     """
     rows = thrower.rows([args.plant])
     how = {

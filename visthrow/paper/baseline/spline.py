@@ -1,16 +1,16 @@
-"""Payload's path from hover to release: a septic spline, jointly optimised waypoints and segment
-times, and its flatness.
+"""Plan the payload's path from hover to release: a septic spline with jointly optimised waypoints
+and segment times; compute states and inputs by differential flatness.
 
-Segments of degree 7 meet with derivatives up to the fifth, so that the body rates of the flat
-vehicle are continuous. The path starts at rest with the vehicle level (all derivatives 0) and ends
-with the release's velocity and no acceleration or higher derivative, so that it goes on as flight
-at constant velocity: the reference of a controller whose horizon looks past the release. With four
-segments and given waypoints the conditions fix every coefficient.
+Derivatives up to the fifth are continuous between segments of degree 7, so that the body rates of
+the flat vehicle are continuous. The path starts at rest with the vehicle level (all derivatives 0).
+It ends with the release's velocity and without acceleration or higher derivatives. After its end it
+continues at constant velocity, as a reference for a controller whose horizon extends beyond the
+release. With four segments the waypoints determine all coefficients.
 
-The optimisation is over the waypoints and times: ``rho int |snap|^2 dt + w_t T`` plus penalties on
-speed, acceleration and workspace (the paper, Sec. IV-A; bounds and penalties' weights are ours).
-Two more penalties are ours, on the thrust vector and its turning: without them short plans flip the
-vehicle in ways that no quadrotor follows."""
+The optimisation over waypoints and times minimises ``rho int |snap|^2 dt + w_t T`` plus penalties
+on speed, acceleration and workspace (the paper, Sec. IV-A; bounds and weights of penalties are
+ours). Two further penalties are ours, on the thrust vector and its rotation: without them short
+plans flip the vehicle in ways that no quadrotor can follow."""
 
 import math
 from collections.abc import Callable
@@ -29,58 +29,58 @@ from visthrow.paper.baseline.pendulum_model import INPUTS, STATES, Pendulum
 
 SEGMENTS = 4
 ORDER = 8
-SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at the start
+SMOOTH = 6  # derivatives 0 to 5 are continuous between segments, and fixed at the start
 
-PLANE = [0, 2]  # axes of the throw: ahead and up
-UP = np.array([0.0, GRAVITY])  # holds against gravity, in the plane [m/s^2]
+PLANE = [0, 2]  # axes of the throw: forward and up
+UP = np.array([0.0, GRAVITY])  # acceleration against gravity, in the plane [m/s^2]
 
-END = 5  # derivatives 0 to 4 are given at the release
+END = 5  # derivatives 0 to 4 are fixed at the release
 
 SAMPLES = 30
-"""Samples of a segment, for penalties and energy, while a path is improved."""
+"""Samples of a segment, for penalties and energy, during the optimisation of a path."""
 DENSE = 300
-"""Samples of a segment by which a path is judged, as thrust has narrow peaks."""
+"""Samples of a segment for the final value of a path, as thrust has narrow peaks."""
 
 
 class PlanError(VisthrowError):
-    """A trajectory that cannot be planned."""
+    """Planning a trajectory failed."""
 
 
 LONGEST = (2.4, 1.8, 1.4, 1.1, 0.9)
 SHORTEST = 0.4
 COARSE = 0.1
-"""Durations that are tried first: several starts, the shortest, the step [s].
+"""Durations of the coarse search: several first ones, the shortest, the step [s].
 
-The best result is taken.
+The best result is used.
 """
 
 EVEN = 0.02
-"""Weight of the squared logarithm of a segment's share over the first one's, relative to the
-duration's [s]: without it the segments grow so uneven that the path rings.
+"""Weight of the squared logarithm of the ratio of a segment's time to that of the first one,
+relative to the weight of the duration [s]; without it the segments become so unequal that the path
+oscillates.
 """
 
 MOST_UNEVEN = float(np.log(2.0))
-"""That logarithm past which the penalty acts: a segment of a few milliseconds would slip between
-the samples.
+"""Size of this logarithm above which the penalty acts; a segment of a few milliseconds would be
+missed by the samples.
 """
 
-# factor on what the thrust's vertical part lacks [1/N]: past zero the vehicle turns over and the
-# path is lost
+# factor on the missing vertical thrust [1/N]; below zero the vehicle inverts and the path is
+# useless
 STIFF = 6.0
 
-DIFFERENCE = 1e-6  # step of the objective's slopes, in m and in logarithms of time
+DIFFERENCE = 1e-6  # finite-difference step, in m and in logarithms of time
 
-# evaluations of the objective at each duration, which starts from the path of the one before
+# evaluations of the objective at each duration, starting from the previous duration's path
 EVALUATIONS = 100
 
-HOPELESS = 2.0  # ratio of objectives at which shortening ends
+HOPELESS = 2.0  # ratio of the objective to the best one at which the search stops
 
 
 @dataclass(frozen=True)
 class PlanParams:
-    """Weights and soft bounds.
-
-    Weights ``duration`` and ``energy`` as in the paper's table; the rest is ours.
+    """Weights and soft bounds; ``duration`` and ``energy`` are those of the paper's table, the
+    others are ours.
     """
 
     duration: float = 30e3  # w_t [1/s]
@@ -89,32 +89,33 @@ class PlanParams:
     max_acceleration: float = 12.0  # of the payload [m/s^2]
     floor: float = 0.5  # lowest height of the payload [m]
     ceiling: float = 2.2  # highest height of the payload [m]
-    backward: float = 0.4  # how far behind the start the payload may swing out [m]
+    backward: float = 0.4  # largest distance of the payload behind the start [m]
     max_thrust: float = 12.0  # of the vehicle [N]
-    least_lift: float = 0.8  # vertical part of the thrust [N]
-    least_pull: float = 0.4  # vertical part of the cable's pull, in the payload's weights [-]
-    max_turn: float = 9.0  # of the thrust's direction [rad/s]
-    # of squared excess, integrated over time; relative to the bound, or in m and weights [1/s]
+    least_lift: float = 0.8  # lowest vertical thrust [N]
+    least_pull: float = 0.4  # lowest vertical force of the cable, in weights of the payload [-]
+    max_turn: float = 9.0  # rotation rate of the thrust's direction [rad/s]
+    # weight of the squared excess, integrated over time [1/s]; the excess is relative to the bound,
+    # or in m or weights
     penalty: float = 1e5
 
 
 @dataclass(frozen=True)
 class Spline:
-    """Piecewise polynomial of the payload; constant velocity after its end, rest before
-    its start.
+    """A piecewise polynomial of the payload's position, constant before its start and with constant
+    velocity after its end.
     """
 
-    times: ndarray  # of the segments [s], shape (S,)
-    coefficients: ndarray  # of t^0 to t^7 in each segment's own time, shape (S, 8, 3)
+    times: ndarray  # durations of the segments [s], shape (S,)
+    coefficients: ndarray  # of t^0 to t^7, t from the segment's start, shape (S, 8, 3)
 
     @property
     def duration(self) -> float:
-        """Time from start to release [s]."""
+        """Return the time from start to release [s]."""
         return float(self.times.sum())
 
     def sample(self, time: ndarray, derivatives: int = 6) -> ndarray:
-        """Payload's position and derivatives [m/s^n] at times since the start [s], shape (T,):
-        shape (T, 2 or more derivatives, 3).
+        """Return the payload's position and derivatives [m/s^n] at times since the start [s], shape
+        (T,), as an array of shape (T, derivatives, 3); two derivatives or more.
         """
         time = np.atleast_1d(np.asarray(time, dtype=float))
         clipped = np.clip(time, 0.0, self.duration)
@@ -134,7 +135,7 @@ def _rows(time: ndarray, derivatives: int = SMOOTH) -> ndarray:
     return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
 
 
-# the same where a segment begins and where it ends, in units of its time
+# these rows at a segment's start and at its end, in units of its time
 BEGINS, ENDS = _rows(np.array([0.0, 1.0]))
 
 
@@ -150,8 +151,8 @@ def _coefficients(
     velocity: ndarray,
     times: ndarray,
 ) -> ndarray:
-    """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B
-    paths at once.
+    """Return the coefficients of B paths in units of each segment's time, which keeps the matrix
+    well conditioned.
 
     Waypoints (B, 3, D), times (B, 4); returns (B, 4, 8, D).
     """
@@ -180,16 +181,17 @@ def _coefficients(
 def residuals(
     unit: ndarray, times: ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
 ) -> dict[str, ndarray]:
-    """Objective of B planar paths (along the throw, up) as sums of squares.
+    """Return the residuals of the objective for B planar paths (along the throw, up).
 
     Args:
-        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2), of times [s], shape
-            (B, 4).
-        times, params, model, samples: of each segment.
+        unit: coefficients in units of each segment's time, shape (B, 4, 8, 2).
+        times: durations of the segments [s], shape (B, 4).
+        params: weights and bounds. model: the pendulum.
+        samples: number of samples of each segment.
 
     Returns:
-        ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose squares add up to each part of
-        the objective.
+        ``duration``, ``energy``, ``penalty``: arrays (B, ...) whose sums of squares are the parts
+        of the objective.
     """
     count = len(times)
     path = np.einsum("tdk,bskc->dbstc", _sample_rows(samples), unit)
@@ -234,10 +236,10 @@ def optimise(
     Raises PlanError: the optimisation does not find a path.
 
     Args:
-        model, params: whose thrust the bounds are on.
-        start_w, end_w: [m], shape (3,). velocity_w: at the release [m/s], shape (3,).
-        tick: period and offset [s]: the duration is the offset and a whole number of periods, so
-            that a controller of that period can release at its end.
+        model: the pendulum. params: weights and bounds.
+        start_w, end_w: [m], shape (3,). velocity_w: velocity at the release [m/s], shape (3,).
+        tick: period and offset [s]: the duration is the offset plus a whole number of periods, so
+            that a controller with this period can release at the end.
     """
     begin, end, velocity = (vector[PLANE] for vector in (start_w, end_w, velocity_w))
 
@@ -264,8 +266,8 @@ def optimise(
 
 
 def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, ndarray]:
-    """Objective, duration and variables of the best: at several starts on a coarse grid of
-    durations, then on the fine one about it.
+    """Return objective, duration and variables of the best path, by a search on a coarse grid of
+    durations from several first ones, and then on a fine grid around the best.
     """
 
     def improve(x: ndarray, total: float) -> tuple[ndarray, float]:
@@ -287,11 +289,11 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
 
 
 def _descend(improve, x: ndarray, totals: ndarray) -> tuple[float, float, ndarray]:
-    """Return the best of a path that is shortened step by step, each from the one before, till the
-    objective is :data:`HOPELESS` times the best.
+    """Return the best path of a series with decreasing durations, each optimised from the previous
+    one, until the objective is :data:`HOPELESS` times the best.
 
-    From a long path down, the vehicle never turns over: short plans have local optima in which it
-    does."""
+    Starting from a long path avoids the local optima of short paths in which the vehicle
+    inverts."""
     best = (np.inf, float(totals[0]), x)
     for total in totals:
         x, value = improve(x, float(total))
@@ -303,15 +305,15 @@ def _descend(improve, x: ndarray, totals: ndarray) -> tuple[float, float, ndarra
 
 
 def _ticks(high: float, low: float, period: float, offset: float) -> ndarray:
-    """Offset plus whole periods between two durations, falling."""
+    """Return the durations, offset plus whole periods, between two limits, in descending order."""
     first = np.floor((high - offset) / period + 1e-6)
     last = np.ceil((low - offset) / period - 1e-6)
     return offset + period * np.arange(first, last - 1, -1)
 
 
 def _base(begin: ndarray, end: ndarray, velocity: ndarray, total: float) -> ndarray:
-    """Waypoints on the single septic with the same ends, up to the third derivative, that takes a
-    total time [s].
+    """Return waypoints on the single septic polynomial with the same duration [s] and the same ends
+    up to the third derivative.
     """
     right = np.zeros((ORDER, len(begin)))
     right[0] = begin
@@ -322,11 +324,11 @@ def _base(begin: ndarray, end: ndarray, velocity: ndarray, total: float) -> ndar
 
 
 def flat_reference(model: Pendulum, path: ndarray) -> tuple[ndarray, ndarray]:
-    """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path in the plane of x and
-    z, position and five derivatives, shape (T, 6, 3).
+    """Return states (T, 16) and inputs (T, 4) of the pendulum along a payload's path in the plane
+    of x and z, given by position and five derivatives, shape (T, 6, 3).
 
-    The vehicle pitches, and does not roll or yaw. Raises PlanError: the payload falls freely, where
-    the cable has no direction.
+    The vehicle pitches and does not roll or yaw. Raises PlanError: the payload is in free fall,
+    where the cable's direction is undefined.
 
     Source: Sreenath, Lee, Kumar, CDC 2013, Lemma 1: payload position and heading are flat outputs.
     """
@@ -350,13 +352,15 @@ def flat_reference(model: Pendulum, path: ndarray) -> tuple[ndarray, ndarray]:
 
 
 def _turn(force: ndarray, change: ndarray) -> ndarray:
-    """Pitch rate of planar forces times their squares, from their rates of change, shape (T,)."""
+    """Return the pitch rate times the squared norm of planar forces, from their time derivatives,
+    shape (T,).
+    """
     return change[:, 0] * force[:, 1] - change[:, 1] * force[:, 0]
 
 
 def _thrust(model: Pendulum, chain: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path in
-    the plane (6, T, 2).
+    """Return thrust vector [N], cable direction and the time derivatives of both, in the order
+    thrust, derivative, direction, derivative, for a planar path (6, T, 2).
     """
     _, _, acc, jerk, snap, crackle = chain
     unit = _unit(acc + UP, jerk, snap, crackle)
@@ -367,7 +371,7 @@ def _thrust(model: Pendulum, chain: ndarray) -> tuple[ndarray, ndarray, ndarray,
 
 
 def _unit(*chain: ndarray) -> list[ndarray]:
-    """Return the unit vector of the first and its derivatives, from a vector and its derivatives,
+    """Return the unit vector of a vector and its derivatives, from the vector and its derivatives,
     shape (T, D) each.
     """
 

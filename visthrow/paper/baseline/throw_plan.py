@@ -1,8 +1,8 @@
-"""A planned throw: where the payload is let go and how fast, its path, and the reference of the
-controller on its grid of periods.
+"""Plan a throw: the release state of the payload, its path, and the controller's reference at the
+control periods.
 
-Source: the paper, Sec. IV-A: release height and speed are mirrored from a learnt policy, the
-release state follows from the drag-free flight to the target. The release is horizontal."""
+Source: the paper, Sec. IV-A. Release height and speed are those of a learnt policy; the release
+position follows from drag-free flight to the target. The release is horizontal."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,23 +20,23 @@ START_HEIGHT = 0.95  # height of the payload in hover (the paper, Sec. IV-A) [m]
 
 POLICY_RELEASES = {1.5: (1.107, 2.270), 2.0: (1.127, 2.935), 2.5: (1.146, 3.602)}
 """Target [m] -> height [m] and speed [m/s] at separation of the shipped state policy in the
-training simulator; mean of five flights. :func:`measure` reads them off any policy.
+training simulator, means of five flights. :func:`measure` measures them for any policy.
 """
 
 
 @dataclass(frozen=True)
 class ReleaseState:
-    """State at which the payload is let go, and what follows."""
+    """The payload's state at the release, and its flight afterwards."""
 
     pos_w: ndarray  # [m], shape (3,)
     vel_w: ndarray  # [m/s], shape (3,)
-    fall_time: float  # from release to landing [s]
+    fall_time: float  # time from release to landing [s]
     landing_height: float  # of the payload's centre [m]
 
 
 def landing_point(pos_w: ndarray, vel_w: ndarray, landing_height: float) -> tuple[ndarray, ndarray]:
-    """Return landing points (..., 2) [m] and times (...) [s] of payloads released at states, shape
-    (..., 3) each; NaN where the landing height is never passed.
+    """Return landing points (..., 2) [m] and flight times (...) [s] of payloads released at
+    positions and velocities, shape (..., 3) each; NaN if the landing height is never reached.
     """
     with np.errstate(invalid="ignore"):
         time = fall_time(pos_w[..., 2] - landing_height, vel_w[..., 2], floor=-np.inf)
@@ -44,10 +44,10 @@ def landing_point(pos_w: ndarray, vel_w: ndarray, landing_height: float) -> tupl
 
 
 def release_for(target: float, height: float, speed: float, landing_height: float) -> ReleaseState:
-    """Release state of a throw along x to a target [m], at a height [m] with a horizontal speed
-    [m/s]; landing is the payload's centre's.
+    """Return the release state of a throw along x at a target [m], at a height [m] with a
+    horizontal speed [m/s]; ``landing_height``: of the payload's centre [m].
 
-    Raises ConfigError: no throw: a height below the landing's, or no speed.
+    Raises ConfigError: the height is not above the landing height, or the speed is not positive.
     """
     if not (height > landing_height and speed > 0.0):
         raise ConfigError(
@@ -60,8 +60,8 @@ def release_for(target: float, height: float, speed: float, landing_height: floa
 
 
 def default_release(target: float) -> tuple[float, float]:
-    """Height [m] and speed [m/s] of the shipped policy's release at a target [m], between the
-    measured ones linear.
+    """Return height [m] and speed [m/s] of the shipped policy's release at a target [m],
+    interpolated linearly between measured ones.
     """
     names = sorted(POLICY_RELEASES)
     return tuple(
@@ -70,8 +70,9 @@ def default_release(target: float) -> tuple[float, float]:
 
 
 def read_release(log: FlightLog) -> tuple[float, float]:
-    """Height [m] and speed [m/s] of the payload at the separation that a flight log records;
-    ConfigError where it has none.
+    """Return height [m] and speed [m/s] of the payload at separation in a flight log.
+
+    Raises ConfigError: the log has no separation.
     """
     when = log.meta.get("times", {}).get("separation")
     if when is None:
@@ -85,8 +86,8 @@ def read_release(log: FlightLog) -> tuple[float, float]:
 
 
 def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[float, float]:
-    """Mean height [m] and speed [m/s] of a loaded policy's releases in the training simulator, at a
-    target [m]; of so many seeds.
+    """Return mean height [m] and speed [m/s] of a policy's releases at a target [m], over
+    ``throws`` throws in the training simulator with successive seeds.
     """
     from visthrow.throws.recorded import fly
 
@@ -97,7 +98,7 @@ def measure(loaded, target: float, throws: int = 5, seed: int = 0) -> tuple[floa
 
 @dataclass(frozen=True)
 class ThrowPlan:
-    """One planned throw."""
+    """A planned throw."""
 
     model: Pendulum
     target: float  # [m] along x
@@ -106,12 +107,12 @@ class ThrowPlan:
 
     @property
     def duration(self) -> float:
-        """Planned time from start to landing [s]."""
+        """Return the planned time from start to landing [s]."""
         return self.path.duration + self.release.fall_time
 
     def reference(self, begin: float, period: float, count: int) -> tuple[ndarray, ndarray]:
-        """States (count + 1, 16) at ``begin`` [s] and each period on; inputs (count, 4) in the
-        middle of the periods.
+        """Return states (count + 1, 16) at ``begin`` [s] and after each period, and inputs
+        (count, 4) in the middle of the periods.
         """
         ends = begin + period * np.arange(count + 1)
         states = flat_reference(self.model, self.path.sample(ends))[0]
@@ -130,10 +131,10 @@ def plan_throw(
     period: float = 0.02,
     lag: float = 0.0,
 ) -> ThrowPlan:
-    """Plan a throw along x from hover at the origin; the first arguments as of :func:`release_for`.
+    """Plan a throw along x from hover at the origin; first arguments: see :func:`release_for`.
 
-    The release falls on a whole number of the controller's periods [s] and the lag [s] from the
-    latch to separation."""
+    The release is at a whole number of the controller's periods [s] plus the lag [s] from latch to
+    separation."""
     release = release_for(target, height, speed, landing_height)
     start = np.array([0.0, 0.0, START_HEIGHT])
     path = optimise(model, start, release.pos_w, release.vel_w, params, (period, lag % period))

@@ -1,4 +1,4 @@
-"""The baseline as one more thrower: sets of throws as units of work, for ``visthrow compare`` and
+"""Throw with the baseline: sets of throws as units of work, for ``visthrow compare`` and
 ``visthrow report``.
 """
 
@@ -21,7 +21,7 @@ from visthrow.paper.results import PROTOCOL, Result, Unit, columns_of, join, key
 from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.throws.reference_protocol import batches
 
-IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
+IDEAL = (  # the controller's model, in addition to :data:`visthrow.throws.plants.PLANTS`
     "pendulum"
 )
 
@@ -30,16 +30,16 @@ MADE_UP = {
     "delay": "all delays but the release's lag made up for",
     "both": "all delays made up for",
 }
-"""Compensations that are compared, see :func:`visthrow.paper.baseline.fly_plan.delays_of`."""
+"""Compared compensation -> description; see :func:`visthrow.paper.baseline.fly_plan.delays_of`."""
 
 BOUNDS = ("payload and thrust", "payload")
-"""What plans bound: ours, and the payload alone as the paper's do."""
+"""Bounded quantities of plans: ours, and only the payload, as in the paper."""
 
 _experiment = cache(load_experiment)
 
 
 def title_of(plant: str, compensation: str) -> str:
-    """Return a row's name, with plant and condition."""
+    """Return a row's name with plant and compensation."""
     return "TO+MPC, own model (ideal)" if plant == IDEAL else f"TO+MPC, {MADE_UP[compensation]}"
 
 
@@ -59,19 +59,19 @@ def unit(
     overrides: Sequence[str] = (),
     batch: int = 0,
 ) -> Unit:
-    """Return the unit of so many throws with the baseline at a target [m] along x.
+    """Return a unit of throws with the baseline at a target [m] along x.
 
     Args:
-        plant: :data:`IDEAL`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
-            number of the batch.
-        compensation: of :data:`MADE_UP`; "none" in the own model.
-        target, throws, seed: of starts and noise.
-        height, speed: of the payload at release [m], [m/s]; default the learnt policy's.
+        plant: :data:`IDEAL`, or a name in :data:`visthrow.throws.plants.PLANTS`.
+        compensation: name in :data:`MADE_UP`; "none" in the controller's model.
+        target: distance [m]. throws: number of throws. seed: seed of initial states and noise.
+        height, speed: height [m] and speed [m/s] of the payload at release; default those of the
+            learnt policy.
         w_t, rho: weights of duration and energy; default those of
             :class:`visthrow.paper.baseline.spline.PlanParams`.
-        bounds: of :data:`BOUNDS`. config_name: train config whose plant is flown. overrides: its
-            changes.
-        batch: see above.
+        bounds: entry of :data:`BOUNDS`.
+        config_name: train config whose plant is flown. overrides: changes of it.
+        batch: index of the batch on a reference plant.
     """
     default_height, default_speed = default_release(target)
     params = PlanParams()
@@ -98,7 +98,7 @@ def unit(
 def units(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, **how: Any
 ) -> list[Unit]:
-    """:func:`unit`, cut into the batches in which reference plants are flown."""
+    """Return the units of :func:`unit`, one for each batch of a reference plant."""
     if plant in (IDEAL, "hybrid"):
         return [unit(plant, compensation, target, throws, seed, **how)]
     return [
@@ -109,7 +109,7 @@ def units(
 def plan_of(experiment: Experiment, unit: Unit) -> ThrowPlan:
     """Return the plan of a unit on an experiment's plant."""
     params = replace(PlanParams(), duration=unit["w_t"], energy=unit["rho"])
-    if unit["bounds"] != BOUNDS[0]:  # the paper's plan, which a vehicle need not be able to follow
+    if unit["bounds"] != BOUNDS[0]:  # the paper's plan, which a vehicle may not be able to follow
         params = replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
     release = experiment.release
     return plan_throw(
@@ -125,8 +125,8 @@ def plan_of(experiment: Experiment, unit: Unit) -> ThrowPlan:
 
 
 def fly_unit(unit: Unit) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of
-    the controller's steps [ms].
+    """Plan and fly a unit; return columns of the throws, and the planned duration [s] and the
+    computation times of the controller's steps [ms].
     """
     experiment = _experiment(unit["config"], tuple(unit["overrides"]))
     plan = plan_of(experiment, unit)
@@ -141,7 +141,7 @@ def fly_unit(unit: Unit) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             plan, unit["plant"], experiment, delays, count, seed, unit["batch"], where
         )
     columns = columns_of(flown)
-    columns.pop("step_times", None)  # as many as throws by chance
+    columns.pop("step_times", None)  # no column of throws, even if its length happens to match
     extra = {"planned": round(plan.duration, 6)}
     if len(flown.step_times):
         steps = 1e3 * np.percentile(flown.step_times, (50, 99))
@@ -150,8 +150,8 @@ def fly_unit(unit: Unit) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
-    """Plant and compensation of a table's rows: the own model, and each plant under each
-    compensation.
+    """Return plant and compensation of a table's rows: the controller's model, and each plant with
+    each compensation.
     """
     return [(IDEAL, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
 
@@ -159,8 +159,8 @@ def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
 def fly_units(
     sets: Sequence[list[Unit]], folder: str | Path, say: Callable[[str], None]
 ) -> list[Result]:
-    """Results of sets of units, the batches of each joined; those that the folder holds are not
-    flown again.
+    """Return the results of sets of units, with the batches of each set joined. Results in the
+    folder are reused.
     """
     solutions = work(
         [u for part in sets for u in part],

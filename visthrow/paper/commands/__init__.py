@@ -1,1 +1,1 @@
-"""Commands that reproduce the paper, a module each."""
+"""Commands that reproduce the paper, one module for each."""

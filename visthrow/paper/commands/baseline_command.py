@@ -1,5 +1,5 @@
-"""``visthrow baseline``: plan with splines, track with MPC, throw: by target, and its front with
-learnt policies on it.
+"""``visthrow baseline``: plan throws with splines and track them with MPC; compare by target, and
+with learnt policies on the Pareto front.
 """
 
 import argparse
@@ -25,7 +25,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Plan, throw, print, write."""
+    """Plan and throw, print the tables and write the page."""
     from visthrow.cli import compare
     from visthrow.common.storage import writable
     from visthrow.paper import results
@@ -88,7 +88,9 @@ def _describe(args: argparse.Namespace, bounds: str) -> dict[str, Any]:
 
 
 def _list_units(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
-    """Units of each row: the own model first, then each plant under each compensation."""
+    """Yield the units of each row: the MPC's model first, then each plant with each
+    compensation.
+    """
     from visthrow.paper.baseline import thrower
 
     releases = _releases(args)
@@ -101,8 +103,8 @@ def _list_units(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str
 
 
 def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
-    """Units of each setting of the sweep: in the own model and, all delays made up for, on the
-    plants.
+    """Yield the units of each setting of the sweep: in the MPC's model, and on the plants with all
+    delays compensated.
     """
     from visthrow.paper.baseline import front, thrower
 
@@ -129,7 +131,7 @@ def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:
 
 
 def _throw(name: str, args: argparse.Namespace) -> Any:
-    """Throws of a learnt policy in the training simulator, as ``visthrow compare`` throws them."""
+    """Throw with a learnt policy in the training simulator, as ``visthrow compare`` does."""
     from visthrow.cli.compare import throw_hybrid
     from visthrow.paper import results
     from visthrow.paper.baseline.front import FRONT_TARGET

@@ -8,7 +8,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print records."""
+    """Print the records."""
     from visthrow.common.errors import VisthrowError, suggest
     from visthrow.paper import measurements
 

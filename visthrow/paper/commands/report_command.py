@@ -1,4 +1,4 @@
-"""``visthrow report``: one page with the paper's evidence and ours, from records."""
+"""``visthrow report``: write one page with the paper's results and ours, from records."""
 
 import argparse
 import time
@@ -47,9 +47,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _records(name: str) -> Path:
-    """Folder of records, as ``visthrow sweep collect`` makes one.
+    """Return the folder of records that ``visthrow sweep collect`` wrote.
 
-    Raises StorageError: there is none.
+    Raises StorageError: it does not exist or holds no records.
     """
     from visthrow.paper.report.result_set import PARTS
 
@@ -63,7 +63,7 @@ def _records(name: str) -> Path:
 
 
 def _folder(name: str) -> Path:
-    """Folder or file of results of throws. Raises StorageError: there is none."""
+    """Return the folder or file with results of throws. Raises StorageError: there are none."""
     path = Path(name)
     if not path.is_file() and not any(path.glob("*.json")):
         actual = "no *.json in it" if path.is_dir() else "no such folder"
@@ -74,7 +74,7 @@ def _folder(name: str) -> Path:
 
 
 def sections(thrown) -> list:
-    """Return the sections, each followed by the text beside its data."""
+    """Return the sections, each followed by the recorded text on its data."""
     from dataclasses import replace
 
     from visthrow.common.workers import status
@@ -104,7 +104,7 @@ def sections(thrown) -> list:
 
 
 def summary(chapter) -> str:
-    """Return the table that is printed, that of the policies' throws."""
+    """Return the table of the policies' throws, which is printed."""
     from visthrow.view.parts import Grid
 
     grids = [part for part in chapter.parts if isinstance(part, Grid)]

@@ -1,5 +1,5 @@
-"""``visthrow sweep``: work lists of training runs and throws in resumable pieces, on several GPUs
-or a cluster.
+"""``visthrow sweep``: do lists of training runs and throws in resumable units, on several GPUs or a
+cluster.
 """
 
 import argparse
@@ -18,7 +18,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, tell, collect."""
+    """Run the chosen action on a list."""
     from visthrow.paper.sweep import sweep_record as record
     from visthrow.paper.sweep.work_units import load_list
 
@@ -51,7 +51,7 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     def say(text: str) -> None:
         print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
 
-    # so that a batch system's signal also ends in checkpoints
+    # a batch system's signal also leads to checkpoints
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if args.slurm is not None:
@@ -94,7 +94,7 @@ def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
 
     if not args.units:
         raise ConfigError("sweep work: no --units; expected ids as `visthrow sweep run` gives them")
-    # a shell that starts a sweep in the background has SIGINT ignored, which processes inherit
+    # in a background job of a shell SIGINT is ignored, which child processes inherit
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if args.parent:
         threading.Thread(target=_follow, args=(args.parent,), daemon=True).start()
@@ -102,7 +102,7 @@ def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
 
 
 def _follow(parent: int) -> None:
-    """Stop this process as Ctrl-C does once its parent is gone."""
+    """Interrupt this process like Ctrl-C when its parent has ended."""
     while os.getppid() == parent:
         time.sleep(0.5)
     os.kill(os.getpid(), signal.SIGINT)
