@@ -1,1 +1,3 @@
-"""Several vehicles throw one load: an optional room on the blocks of :mod:`sim`."""
+"""Cooperative throws of several vehicles with one load, an optional room that uses the blocks of
+:mod:`sim`.
+"""

@@ -1,7 +1,8 @@
-"""The same bodies by MuJoCo, in float64: what a policy of the tree of rods is thrown on besides.
+"""Simulate the bodies of a team with MuJoCo in float64, as an independent engine for policies that
+were trained on the tree of rods.
 
-Every vehicle is on a joint of its own with its cable below it; an equality constraint holds the
-cable's end in the load until the vehicle lets go, and the cable then falls with it."""
+Every vehicle has a free joint and its cable below it. An equality constraint attaches the cable's
+end to the load until separation; afterwards the cable stays with the vehicle."""
 
 import mujoco
 import numpy as np
@@ -12,17 +13,17 @@ from sim.reference.model import add_chain, add_vehicle, new_spec
 from sim.solvers import World
 from sim.solvers.rods import build_place
 
-STEP = 5e-4  # of RK4 [s]; an exchange is a whole number of them
+STEP = 5e-4  # step of RK4 [s]; an exchange consists of a whole number of steps
 STIFF = (2.0 * STEP, 1.0)  # time constant [s] and damping ratio of the constraint
 
 
 class MujocoTeam:
-    """Behind the same interface as :class:`visthrow.cooperative.tree.TreeSolver`, on a CPU."""
+    """A solver with the interface of :class:`visthrow.cooperative.tree.TreeSolver`, on a CPU."""
 
     capturable = False
 
     def __init__(self, world: World, team: int):
-        """Compile a model a world."""
+        """Compile one model for each world."""
         count = world.count
         self.world = world
         self.team = team
@@ -107,7 +108,7 @@ class MujocoTeam:
 
 
 def _compile(members: list[tuple]) -> "mujoco.MjModel":
-    """Model of a world from the bodies and ropes of its vehicles."""
+    """Return the model of a world from the bodies and ropes of its vehicles."""
     spec = new_spec(constraints=True)
     spec.option.timestep = STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
@@ -129,7 +130,7 @@ def _compile(members: list[tuple]) -> "mujoco.MjModel":
 
 
 def _vehicle(body, rope: RopeParams) -> "mujoco.MjSpec":
-    """A vehicle with its cable and the site ``end`` at the cable's lower end."""
+    """Return a vehicle with its cable and the site ``end`` at the cable's lower end."""
     spec = new_spec(constraints=True)
     vehicle = add_vehicle(spec, body)
     last = add_chain(rope, vehicle, "universal", load=False)

@@ -1,6 +1,6 @@
-"""Schema of the cooperative task: an experiment whose vehicle and rope are those of every member.
+"""Schema of the cooperative task: an experiment whose vehicle and rope apply to every member.
 
-The rope's ``payload_mass`` is a member's share of the load."""
+The rope's ``payload_mass`` is each member's share of the load."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -18,55 +18,56 @@ from visthrow.task.measurement import pilots_hover
 Range = tuple[NotNegative, NotNegative]
 
 MESSAGE = 9
-"""Width of what an actor sees of another vehicle: position from its own 3, rotation 6."""
+"""Width of an actor's observation of another vehicle: relative position 3, rotation 6."""
 
 
 @dataclass(frozen=True)
 class TeamParams(Bounded):
-    """A team, its start, what its members tell one another and what goes wrong."""
+    """A team, its initial states, its messages and its faults."""
 
     vehicles: Annotated[int, Bound(2)] = 2  # V
-    tilt_deg: Range = (25.0, 45.0)  # of the cables from the vertical at the start [deg]
-    across_deg: NotNegative = 20.0  # +- of the formation from across the throw at the start [deg]
+    tilt_deg: Range = (25.0, 45.0)  # angle of the cables from the vertical at the start [deg]
+    # largest angle between the formation and the normal to the throw at the start [deg]
+    across_deg: NotNegative = 20.0
     goal: Range = (0.3, 2.3)  # distance of the goal from the start's centre [m]
-    # age of what a member knows of the others: half of the throws have the lower one [s]
+    # age of a member's data on the others; half of the throws have the lower one [s]
     age: Range = (0.02, 0.06)
-    rotor_reach: Positive = 0.135  # of a vehicle, centre to the outermost tip of a propeller [m]
-    margin: Positive = 0.1  # gap below which a step costs [m]
-    margin_cost: NotNegative = 50.0  # for each metre less, a step
-    contact_cost: NotNegative = 50.0  # of a contact, besides that of any negative end
-    # control step before which no latch trips at the beginning of a training: else the load is
-    # dropped at once; and the shares of the training between which it comes down to 0
+    rotor_reach: Positive = 0.135  # distance from a vehicle's centre to its outermost blade tip [m]
+    margin: Positive = 0.1  # gap below which a step has a cost [m]
+    margin_cost: NotNegative = 50.0  # for each step and each metre below the margin
+    contact_cost: NotNegative = 50.0  # of a contact, in addition to that of every failure
+    # first control step in which latches may trip at the start of a training, without which the
+    # load would be dropped at once; shares of the training between which the step falls to 0
     first_release: Annotated[int, Bound(0)] = 15
     free: tuple[Share, Share] = (0.1, 0.3)
-    # vehicle 0 of the worlds: thrust against the controller's map, delay of its latch
+    # faults of vehicle 0: factor of its thrust, additional delay of its latch
     weak: Range = (1.0, 1.0)  # [-]
     late: Range = (0.0, 0.0)  # [s]
-    faulty: Annotated[float, Bound(0.0, 1.0)] = 0.0  # share of the worlds with each of the two
-    central: bool = False  # whether one policy sees with all members and commands all
+    faulty: Annotated[float, Bound(0.0, 1.0)] = 0.0  # share of the worlds with each fault
+    central: bool = False  # whether one policy observes and commands all members
 
     @property
     def flown(self) -> int:
-        """Vehicles that a call of the policy flies."""
+        """Return the number of vehicles that one call of the policy commands."""
         return self.vehicles if self.central else 1
 
 
 @dataclass(frozen=True)
 class TeamExperiment(Experiment):
-    """All that the training of a team depends on."""
+    """The complete configuration of a team's training."""
 
     team: TeamParams = field(default_factory=TeamParams)
 
 
 LEVELS = 20
-"""Worlds after which faults repeat."""
+"""Number of worlds after which the faults repeat."""
 
 
 def layout_of(experiment: TeamExperiment) -> ob.Layout:
-    """Layout of a member's observation: as of a single vehicle, then the others, their age, and
-    the control steps since the latches tripped.
+    """Return the layout of a member's observation: that of a single vehicle, then the other
+    vehicles, their age, and the control steps since the latches tripped.
 
-    Raises ConfigError: the observation is to hold a goal that is fitted over a throw.
+    Raises ConfigError: the layout requires a goal that is fitted over a throw.
     """
     layout = ob.layout_of(experiment.task.observation)
     if layout.fits:
@@ -79,10 +80,11 @@ def layout_of(experiment: TeamExperiment) -> ob.Layout:
 
 
 def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
-    """Vehicles, releases and ropes of the rows, for :class:`visthrow.cooperative.team_sim.TeamSim`.
+    """Return vehicles, releases and ropes of the rows, for
+    :class:`visthrow.cooperative.team_sim.TeamSim`.
 
-    A share ``faulty`` of :data:`LEVELS` worlds has a weak vehicle, as many a late latch, evenly
-    over their ranges; they repeat.
+    In a share ``faulty`` of :data:`LEVELS` worlds vehicle 0 is weak, and in the same number its
+    latch is late, with values evenly spaced over their ranges. These worlds repeat.
     """
     team = experiment.team
     vehicle = experiment.vehicle
@@ -105,7 +107,7 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
 
 
 def interpolate(interval: tuple[float, float], part: Any) -> Any:
-    """Value at this share of the way from the lower to the upper end."""
+    """Return the value at a share of the way from the lower to the upper end."""
     low, high = interval
     return low + (high - low) * part
 
@@ -116,11 +118,13 @@ FAULTS: dict[str, dict[str, Any]] = {
     "late": {"late": (0.03, 0.03)},
     "old": {"age": (0.06, 0.06)},
 }
-"""Conditions of the throws that are measured; each alone."""
+"""Fault -> changes of the team, for measured throws with a single fault."""
 
 
 def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
-    """The experiment from hover across the throw, in every world with one of :data:`FAULTS`."""
+    """Return the experiment with starts from hover, with the formation normal to the throw, and
+    with one of :data:`FAULTS` in every world.
+    """
     start = experiment.task.start
     hover = {"tilt_deg": (33.0, 37.0), "across_deg": 5.0, "faulty": 1.0}
     hover |= {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
@@ -130,7 +134,7 @@ def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
 
 
 def team_contract(experiment: TeamExperiment) -> dict[str, Any]:
-    """Conditions that a throw shares with the training of its policy."""
+    """Return the conditions that a throw must share with the training of its policy."""
     contract = contract_of(experiment)
     contract["observation"]["dimension"] = experiment.team.flown * layout_of(experiment).dimension
     contract["action"]["dimension"] *= experiment.team.flown

@@ -1,4 +1,4 @@
-"""``visthrow cooperative``: throws of several vehicles with one load."""
+"""``visthrow cooperative``: throw one load with several vehicles."""
 
 import argparse
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 from visthrow.common.arguments import declare
 
 POLICIES = ("pair", "pair_vision")
-"""Shipped policies, each with the configuration of its name in ``configs/cooperative``."""
+"""Shipped policies; ``configs/cooperative`` holds a configuration with the name of each."""
 
 SHIPPED = Path(__file__).with_name("policies")
 
@@ -16,16 +16,16 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Throw once, or many times."""
+    """Throw once, or many times for a comparison."""
     if args.action == "compare":
         return _compare(args)
     return _fly(args)
 
 
 def load(name: str, solver: str) -> tuple[Any, Any, Any]:
-    """Experiment, policy and solver of throws.
+    """Return experiment, policy and solver of throws.
 
-    Raises PolicyError: no such policy; MismatchError: one of another team or task.
+    Raises PolicyError: no such policy; MismatchError: the policy is for another team or task.
     """
     from visthrow.common.errors import PolicyError, VisthrowError, suggest
     from visthrow.common.extras import load_extra
@@ -53,7 +53,7 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
 
 
 def _fly(args: argparse.Namespace) -> int:
-    """Throw once and write what came of it."""
+    """Throw once, print the result and write the files."""
     from visthrow.common.storage import writable
     from visthrow.cooperative.throw_track import record_throw, write
 
@@ -98,7 +98,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    """A row of the table."""
+    """Return a row of the table."""
     figures = [
         f"{row[name]:.3f}" if name in row else "-"
         for name in ("error_mean", "error_p95", "duration_mean")

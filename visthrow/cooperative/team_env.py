@@ -1,8 +1,9 @@
-"""TeamEnv: the cooperative task as rsl_rl's vectorised environment, a row a vehicle.
+"""TeamEnv: the cooperative task as rsl_rl's vectorised environment, with one row for each vehicle.
 
-All rows are flown by one policy, each from its own view, or a world's rows at once from all views;
-they end together. As in :class:`visthrow.training.env.ThrowEnv`, nothing branches on data: a
-rollout can be captured."""
+One policy flies all rows, either each from its own observation, or all rows of a world from all
+their observations. The rows of a world end together. As in
+:class:`visthrow.training.env.ThrowEnv`, a step does not branch on data, so a rollout can be
+captured."""
 
 import math
 from typing import ClassVar
@@ -26,17 +27,18 @@ from visthrow.training.env.throw_episodes import ThrowEpisodes
 
 
 class TeamEnv(ThrowEpisodes):
-    """Worlds of a team. Observation groups: ``actor`` and ``critic``.
+    """Worlds of a team, with the observation groups ``actor`` and ``critic``.
 
-    The critic sees all vehicles, its own first, without noise, the load with its velocity, the
-    time, every latch, mass and voltage, and how old the others' poses are.
+    The critic observes all vehicles without noise, its own first, the load with its velocity, the
+    time, every latch, mass and voltage, and the age of the others' poses.
 
     Attributes:
-        earliest: control step of an episode before which no request counts, shape ().
-        last: what the last step ended, each over the worlds: ``released``, ``negative``,
+        earliest: first control step of an episode in which requests count, shape ().
+        last: results of the last step, each over the worlds: ``released``, ``negative``,
             ``contact`` (bool), ``landing_error`` [m], ``duration`` [s], ``landing_w`` [m],
-            ``clearance`` [m], ``gap`` [m], ``apart`` [s], between first and last separation, the
-            load's position [m] and velocity [m/s] at the end of the step.
+            ``clearance`` [m], ``gap`` [m], ``apart``, the time between first and last separation
+            [s], and the load's position ``load_w`` [m] and velocity ``load_vel_w`` [m/s] at the end
+            of the step.
     """
 
     results: ClassVar = ThrowEpisodes.results | {"contact": "episodes"}
@@ -49,13 +51,13 @@ class TeamEnv(ThrowEpisodes):
         count: int | None = None,
         build=None,
     ):
-        """Build simulator and buffers and start all episodes.
+        """Build the simulator and the buffers and start all episodes.
 
         Args:
-            experiment, device: plant, camera, task; "cpu" or "cuda:0".
-            seed: of the simulator's resets; torch's own generator draws the rest.
+            experiment: plant, camera and task. device: "cpu" or "cuda:0".
+            seed: seed of the simulator's resets; torch's generator draws everything else.
             count: number of vehicles; default the experiment's.
-            build: another solver of the bodies, as of :class:`TeamSim`.
+            build: another solver of the bodies; see :class:`TeamSim`.
         """
         self.cfg = experiment
         self.device = device
@@ -103,32 +105,34 @@ class TeamEnv(ThrowEpisodes):
         }
 
     def _rows(self, of_worlds: Tensor) -> Tensor:
-        """Values of worlds, shape (W, ...), for their rows."""
+        """Repeat values of worlds, shape (W, ...), for their rows."""
         shape = (self.worlds, self.team, *of_worlds.shape[1:])
         return of_worlds.unsqueeze(1).expand(shape).flatten(0, 1)
 
     def _worlds(self, of_rows: Tensor) -> Tensor:
-        """Values of rows as (W, V, ...)."""
+        """Return values of rows with shape (W, V, ...)."""
         return of_rows.unflatten(0, (self.worlds, self.team))
 
     def _join(self, of_rows: Tensor) -> Tensor:
-        """Values of rows, a line an actor: of all members side by side where one flies them all."""
+        """Return values of rows with one line for each actor; a central actor has those of all
+        members side by side.
+        """
         return of_rows.reshape(self.num_envs, -1).float()
 
     def _neighbour(self, of_rows: Tensor, k: int) -> Tensor:
-        """Values of the k-th vehicle after each row's own in its world."""
+        """Return the values of the k-th vehicle after each row's own in its world."""
         return self._worlds(of_rows).roll(-k, 1).flatten(0, 1)
 
     def reset(self) -> TensorDict:
-        """Start a new episode everywhere."""
+        """Start a new episode in every world."""
         fresh = torch.ones(self.worlds, device=self.device, dtype=torch.bool)
         self._start(fresh)
         self._observations = self._observe(self._rows(fresh))
         return self._observations
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply unclipped actions, shape (E, 5) or (W, V 5), for one control period; worlds that
-        end start anew.
+        """Apply unclipped actions, shape (E, 5) or (W, V 5), for one control period and restart
+        worlds that end.
         """
         action = self._apply(actions.reshape(-1, act.ACTIONS))
         reward, done = self._judge(action)
@@ -141,9 +145,9 @@ class TeamEnv(ThrowEpisodes):
         return self._observations, paid, self._join(rows).amax(1), {}
 
     def _apply(self, actions: Tensor) -> Tensor:
-        """Fly one control period; returns the clipped actions.
+        """Fly one control period and return the clipped actions.
 
-        Latches trip together, once all requests are as old as the members' link delay.
+        The latches trip together, when all members requested it one link delay before.
         """
         memory = self.buffers
         action = self._command(actions)
@@ -162,10 +166,11 @@ class TeamEnv(ThrowEpisodes):
         return action
 
     def gap(self) -> Tensor:
-        """Least gap between vehicles, cables and load that must not touch [m], shape (W,).
+        """Return the smallest gap between vehicles, cables and load [m], shape (W,).
 
-        Vehicles are spheres of the propellers' reach; a vehicle's own cable is the simulator's to
-        judge (``ROPE_IN_ROTOR``), cables meet at the load.
+        A vehicle is a sphere with the propellers' reach. The simulator checks the distance between
+        a vehicle and its own cable (``ROPE_IN_ROTOR``). Cables meet at the load, so gaps between
+        cables are not checked.
         """
         state = self.views.state
         reach = self.cfg.team.rotor_reach
@@ -185,7 +190,9 @@ class TeamEnv(ThrowEpisodes):
         return self._worlds(torch.stack(gaps).amin(0)).amin(1)
 
     def _handle_landings(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Worlds whose last vehicle has let go in this step, and what follows from it."""
+        """Return the worlds whose last vehicle separated in this step, and the results of their
+        landings.
+        """
         out = self.views.out
         memory = self.buffers
         separated = self._worlds(out["separated"]) != 0
@@ -206,14 +213,16 @@ class TeamEnv(ThrowEpisodes):
         return separated.any(1) & ~attached, chosen
 
     def _clearance(self, flight: Tensor) -> Tensor:
-        """Least distance of the load's flight to any vehicle [m], shape (W,); vehicles stand."""
+        """Return the smallest distance between the flying load and any vehicle, which is assumed
+        not to move [m], shape (W,).
+        """
         time = (flight[:, None] * self._fractions)[:, :, None]
         path = free_flight(self.load_w[:, None], self.load_vel_w[:, None], time)
         offsets = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
         return offsets.norm(dim=-1).flatten(1).amin(1)
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Rewards of the rows and ends of the worlds of the step just made."""
+        """Return the rewards of the rows and whether their worlds end, for the last step."""
         task = self.cfg.task
         state = self.views.state
         team = self.cfg.team
@@ -246,7 +255,7 @@ class TeamEnv(ThrowEpisodes):
         return p.scale * (reward + self._rows(shared)), released | negative
 
     def _start(self, fresh: Tensor) -> None:
-        """Start worlds where ``fresh``, bool, shape (W,)."""
+        """Start episodes in the worlds where ``fresh``, bool, shape (W,)."""
         task = self.cfg.task
         memory = self.buffers
         rows = self._rows(fresh)
@@ -255,7 +264,7 @@ class TeamEnv(ThrowEpisodes):
             self.sim.randomize(task.start, wp.from_torch(mask))
             self._form(fresh)
             self.sim.adopt(wp.from_torch(mask))
-        self._kept = mask  # until the launches have read it
+        self._kept = mask  # an attribute, so that it lives until the launches have read it
         self._restart(rows)
         memory["requests"].masked_fill_(fresh[:, None], 0.0)
         memory["first"].masked_fill_(fresh, 1e6)
@@ -269,7 +278,7 @@ class TeamEnv(ThrowEpisodes):
         torch.where(fresh, interpolate(self.cfg.team.age, part), age, out=age)
 
     def _form(self, fresh: Tensor) -> None:
-        """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
+        """Move vehicles of starting worlds into a formation around the load, and draw a goal."""
         team = self.cfg.team
         state = self.views.state
         goal = self.views.goal_w
@@ -304,7 +313,9 @@ class TeamEnv(ThrowEpisodes):
 
     @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
-        """Actor's and critic's view of the current state; ``fresh``: rows that begin."""
+        """Return the actor's and the critic's observations of the current state; ``fresh``: whether
+        a row's episode begins.
+        """
         state = self.views.state
         memory = self.buffers
         load = self._rows(self.load_w)
@@ -339,8 +350,8 @@ class TeamEnv(ThrowEpisodes):
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
     def _messages(self, poses: Tensor, pos_w: Tensor) -> Tensor:
-        """Poses of the other vehicles, as old as they are, their age in control periods, and
-        the control steps since the latches tripped.
+        """Return the delayed poses of the other vehicles, their age in control periods, and the
+        control steps since the latches tripped.
         """
         noise = self.cfg.task.noise.observation_step
         age = self._rows(self.buffers["age"]) / self.cfg.sim.control_period
@@ -356,7 +367,7 @@ class TeamEnv(ThrowEpisodes):
     def _critic_view(
         self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor
     ) -> Tensor:
-        """Critic's view."""
+        """Return the critic's observation."""
         state = self.views.state
         memory = self.buffers
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)

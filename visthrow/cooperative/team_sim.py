@@ -1,4 +1,4 @@
-"""TeamSim: worlds of several vehicles that carry one load."""
+"""TeamSim: simulate worlds of several vehicles that carry one load."""
 
 from functools import partial
 from typing import Any
@@ -13,20 +13,22 @@ from visthrow.cooperative.tree import TreeSolver
 
 
 class TeamSim(HybridSim):
-    """Batched simulator with a row a vehicle: row ``w * team + v`` is vehicle v of world w.
+    """A batched simulator with one row for each vehicle: row ``w * team + v`` is vehicle v of world
+    w.
 
-    Blocks, latches and outputs are those of a row. A row that separates while others hold on puts
-    out the landing that would follow there and then; that of the last row is the throw's.
+    Blocks, latches and outputs are per row. When a row separates while others still hold the load,
+    its output is the landing of a load that would fly freely from then on; the output of the last
+    row is the landing of the throw.
 
     Attributes:
-        team: vehicles a world, V. worlds: number of worlds W.
+        team: number V of vehicles in a world. worlds: number W of worlds.
     """
 
     def __init__(self, params: PlantParams, worlds: int, team: int, *args: Any, **options: Any):
-        """Allocate ``worlds`` teams; the rest is as for :class:`sim.hybrid.HybridSim`.
+        """Allocate ``worlds`` teams; other arguments: see :class:`sim.hybrid.HybridSim`.
 
-        ``options["build"]`` makes another solver of the bodies, called with a world and
-        ``team=``. Raises ValueError: air that acts on the load.
+        ``options["build"]`` builds another solver of the bodies from a world and ``team=``. Raises
+        ValueError: aerodynamic forces act on the load.
         """
         self.team = team
         self.worlds = worlds
@@ -40,6 +42,6 @@ class TeamSim(HybridSim):
 
     @property
     def load(self) -> tuple["wp.array[Any]", "wp.array[Any]"]:
-        """Position [m] and velocity [m/s] of the loads, each of shape (W,) of vec3."""
+        """Return positions [m] and velocities [m/s] of the loads, each of shape (W,) of vec3."""
         solver: Any = self._exchange.solver  # type: ignore[union-attr]
         return solver.load_pos_w, solver.load_vel_w

@@ -1,4 +1,4 @@
-"""Training of a team's policy by rsl_rl's PPO, and throws with it."""
+"""Train a team's policy by rsl_rl's PPO, and throw with it."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -17,14 +17,16 @@ from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 
 ASKING = 1.0
-"""Mean of the untrained policy's request: the odds that all ask in one step are small otherwise."""
+"""Mean of the untrained policy's release output; with a lower one it would be unlikely that all
+members request a release in the same step.
+"""
 
 
 class TeamTraining(PPOTraining):
     """PPO on :class:`TeamEnv`."""
 
     def __init__(self, experiment: TeamExperiment, device: str, seed: int, eager: bool = False):
-        """Build environment and networks; ``eager``: no rollout is captured in a CUDA graph."""
+        """Build environment and networks; ``eager``: do not capture rollouts in a CUDA graph."""
         torch.manual_seed(seed)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)
@@ -47,13 +49,13 @@ class TeamTraining(PPOTraining):
         super().collect(done)
 
     def policy(self, made_by: dict[str, Any]) -> Policy:
-        """The policy as it stands."""
+        """Return the current policy."""
         return self.export(team_contract(self.experiment), made_by)
 
     def run(self, seconds: float, iterations: int | None = None) -> Iterator[dict[str, float]]:
-        """Train for a time [s], or so many iterations; yields the figures of each.
+        """Train for a time [s] or a number of iterations; yield the figures of each iteration.
 
-        Schedules follow the time where no number of iterations is named.
+        Without a number of iterations, schedules follow the time.
         """
         start = time.perf_counter()
         count = 0
@@ -81,13 +83,16 @@ def fly(
     build: Any = None,
     record: Callable[[TeamEnv], None] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Throw ``count`` times from hover at a target [m] along x, all noise included, as one batch.
+    """Throw ``count`` times from hover at a target [m] along x, with all noise, as one batch.
 
-    Returns what :attr:`TeamEnv.last` held as each ended; one that never did was not released.
+    Returns the values of :attr:`TeamEnv.last` at the end of each throw; a throw without an end is
+    not released.
 
     Args:
-        experiment, fault: conditions, see :func:`visthrow.cooperative.team.as_flown`.
-        policy: of observations (E, D) -> actions (E, 5).
+        experiment, fault: conditions; see :func:`visthrow.cooperative.team.as_flown`.
+        policy: function of observations (E, D) -> actions (E, 5).
+        target: distance [m]. count: number of throws. device: "cpu" or "cuda:0".
+        seed: seed of initial states and noise.
         build: another solver of the bodies.
         record: called with the environment before each step.
     """
@@ -115,11 +120,11 @@ def fly(
 
 
 def throw(experiment: TeamExperiment, *args: Any, **options: Any) -> dict[str, Any]:
-    """Figures of throws; arguments as of :func:`fly`.
+    """Throw and return the figures; arguments: see :func:`fly`.
 
-    ``landed`` and ``contact`` are shares. Errors [m], their bias [m], ``duration`` [s] and
-    ``apart`` [s] are of the throws that landed clear: a load that comes nearer to a vehicle than
-    both radii in its flight touches it.
+    ``landed`` and ``contact`` are shares of the throws. Errors [m], their bias [m], ``duration``
+    [s] and ``apart`` [s] refer to throws that landed without contact. The flying load touches a
+    vehicle if their distance is less than the sum of both radii.
     """
     radii = experiment.rope.payload_radius + experiment.vehicle.collision_radius
     target = options.get("target", 2.0)
@@ -129,7 +134,7 @@ def throw(experiment: TeamExperiment, *args: Any, **options: Any) -> dict[str, A
 
 
 def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict[str, Any]:
-    """Figures of throws."""
+    """Return the figures of throws from their results."""
     released = values["released"]
     touched = values["contact"] | (released & (values["clearance"] < radii))
     good = released & ~touched

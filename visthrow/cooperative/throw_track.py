@@ -1,4 +1,4 @@
-"""One throw as arrays over time, a picture of it, and a recording for the rerun viewer."""
+"""Record one throw as arrays over time, draw it, and write a recording for the rerun viewer."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,24 +20,23 @@ from visthrow.view import style
 DIAGONALS = 0.07 * np.array(
     [[[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]], [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]]]
 )
-"""Ends of the two lines that a vehicle is drawn as, body frame [m], shape (2, 2, 3)."""
+"""Ends of the two lines that represent a vehicle, body frame [m], shape (2, 2, 3)."""
 
 
 @dataclass(frozen=True)
 class ThrowTrack:
-    """A throw of V vehicles whose cables have L segments, T steps until the last separation.
-
-    World frame, [m] and [s].
+    """A throw of V vehicles whose cables have L segments, with T steps until the last separation;
+    world frame, [m] and [s].
     """
 
     time: ndarray  # (T,)
     pos_w: ndarray  # (T, V, 3)
-    frames_w: ndarray  # of :data:`DIAGONALS`, (T, V, 2, 2, 3)
+    frames_w: ndarray  # ends of :data:`DIAGONALS`, (T, V, 2, 2, 3)
     cables_w: ndarray  # joints, (T, V, L + 1, 3)
     attached: ndarray  # (T, V), bool
     load_w: ndarray  # (T, 3)
-    flight_time: ndarray  # after the last separation, (N,)
-    flight_w: ndarray  # of the load, (N, 3)
+    flight_time: ndarray  # times after the last separation, (N,)
+    flight_w: ndarray  # positions of the flying load, (N, 3)
     goal_w: ndarray  # (3,)
     landing_error: float
     released: bool
@@ -46,7 +45,7 @@ class ThrowTrack:
 def record_throw(
     experiment: TeamExperiment, policy: Callable[[torch.Tensor], torch.Tensor], **options: Any
 ) -> ThrowTrack:
-    """Fly one throw; options as of :func:`visthrow.cooperative.team_training.fly`."""
+    """Fly one throw; options: see :func:`visthrow.cooperative.team_training.fly`."""
     rows: list[tuple[ndarray, ...]] = []
 
     def record(env: TeamEnv) -> None:
@@ -72,16 +71,16 @@ def record_throw(
     return ThrowTrack(time[:-1], *columns, *flown)
 
 
-HUES = (style.COLOURS[0], style.COLOURS[3], style.COLOURS[5])  # of vehicles
+HUES = (style.COLOURS[0], style.COLOURS[3], style.COLOURS[5])  # colours of vehicles
 
 
 def picture(track: ThrowTrack, path: Path) -> None:
-    """Write a picture: from the side, and from above."""
+    """Write a picture of the throw from the side and from above."""
     style.use()
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9.2, 4.0), layout="constrained")
-    # at five times it shows vehicles and cables
+    # vehicles and cables are drawn at five times
     steps = np.unique(np.linspace(0, len(track.time) - 1, 5).round().astype(int))
     for axis, columns, name in zip(axes, ([0, 2], [0, 1]), "zy", strict=True):
         for v in range(track.pos_w.shape[1]):
@@ -106,7 +105,7 @@ def picture(track: ThrowTrack, path: Path) -> None:
 
 
 def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
-    """Write a recording for the rerun viewer; ``radius``: of the load [m]."""
+    """Write a recording for the rerun viewer; ``radius``: radius of the load [m]."""
     import rerun as rr
 
     from visthrow.view.rerun_view import TIMELINE, colour_code, recording
@@ -131,7 +130,9 @@ def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
 
 
 def write(track: ThrowTrack, folder: Path, radius: float) -> list[Path]:
-    """Write picture, recording and arrays into a folder; the recording where rerun is there."""
+    """Write picture, arrays and, if rerun is installed, recording into a folder; return the paths;
+    ``radius``: radius of the load [m].
+    """
     import importlib.util
 
     paths = [folder / "throw.png", folder / "throw.npz"]

@@ -1,14 +1,16 @@
-"""Several vehicles with a cable each to one load, as a tree of rods with the load at its root.
+"""Simulate several vehicles, each with a cable to one load, as a tree of rods with the load at its
+root.
 
-Seen from the load, a cable is a chain of slender rods with a vehicle at its outer end. Every part
-asks for a force ``A a + b`` at its inner joint (equations: :mod:`sim.kernels.rope.chain`); at the
-outermost joint A and b are the inverse of the mount's mobility and what holds it back. The sum over
-the cables gives the acceleration of the load, a second pass those of rods and vehicles.
+Starting at the load, a cable is a chain of slender rods with a vehicle at its outer end. For an
+acceleration a of its inner joint, every part requires a force ``A a + b`` there (equations:
+:mod:`sim.kernels.rope.chain`). At the outermost joint A is the inverse of the mount's mobility, and
+b is -A times the mount's acceleration without a cable. The sum over the cables yields the
+acceleration of the load; a second pass yields those of rods and vehicles.
 
 Integration: half a step of drift, accelerations in the middle, a step of kick, half a step of
-drift. The accelerations are solved twice, the second time with the velocities of the middle.
-``h / 2 D + h^2 / 4 K`` joins a rod's inertia, with its damping D and its stiffness K under the
-pull of the last step, so that a snatch of the cable stays stable."""
+drift. The accelerations are solved twice, the second time with the velocities in the middle.
+``h / 2 D + h^2 / 4 K`` is added to a rod's inertia, with its damping D and its stiffness K under
+the tension of the last step, so that a snap of the cable remains stable."""
 
 from typing import Any
 
@@ -33,7 +35,7 @@ def diagonal(like: Any, x: Any):
 
 @wp.func
 def mobility(p: Any, rope: Any, rot: Any):
-    """Acceleration of the mount for a force there, world frame [1/kg]."""
+    """Return the matrix from a force at the mount to its acceleration, world frame [1/kg]."""
     one = type(p.body.mass)(1.0)
     arm = rot * wp.skew(rope.mount)
     inverse = wp.cw_div(type(rope.mount)(one, one, one), p.body.inertia)
@@ -43,7 +45,7 @@ def mobility(p: Any, rope: Any, rot: Any):
 
 @wp.func
 def free(p: Any, rope: Any, rot: Any, w: Any, force_b: Any, torque_b: Any, g: Any):
-    """Acceleration of the mount without a cable, world frame."""
+    """Return the acceleration of the mount without a cable, world frame."""
     turn = angular_acceleration(p, w, torque_b)
     spin = wp.cross(turn, rope.mount) + wp.cross(w, wp.cross(w, rope.mount))
     return rot * (force_b / p.body.mass + spin) + g
@@ -51,18 +53,22 @@ def free(p: Any, rope: Any, rot: Any, w: Any, force_b: Any, torque_b: Any, g: An
 
 @wp.func
 def damping_of(c: Any, n: Any, u: Any, neighbour_n: Any, neighbour_u: Any):
-    """Damping c of the joint to a neighbouring rod, as a force on ``n'``."""
+    """Return the damping of the joint to a neighbouring rod, as a generalised force on ``n' =
+    u``.
+    """
     return c * (wp.cross(wp.cross(neighbour_n, neighbour_u), n) - u)
 
 
 class TreeSolver:
-    """Bodies of W worlds behind :class:`sim.solvers.Exchange`; row ``w * team + v`` is a vehicle.
+    """A solver of the bodies of W worlds for :class:`sim.solvers.Exchange`; row ``w * team + v`` is
+    vehicle v of world w.
 
-    A rope's ``payload_mass`` is the vehicle's share of the load, whose size and turning do not
-    count: all cables end in its centre. A vehicle that lets go keeps its cable.
+    A rope's ``payload_mass`` is the vehicle's share of the load. The load is a point mass at which
+    all cables end. After separation the cable stays with the vehicle.
 
     Attributes:
-        load_pos_w: [m], shape (W,) of vec3. load_vel_w: [m/s], likewise.
+        load_pos_w: positions of the loads [m], shape (W,) of vec3. load_vel_w: their velocities
+            [m/s], shape (W,) of vec3.
     """
 
     capturable = True
@@ -89,7 +95,7 @@ class TreeSolver:
 
 
 def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Kernels that place and advance the bodies; a thread a world."""
+    """Return the kernels that place and advance the bodies, with one thread for each world."""
     t = world.types
     L = world.params.rope.segments
     V = team
@@ -119,11 +125,11 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func
     def rotation_after(bodies: Bodies, row: int, time: real):
-        """Rotation of a vehicle after a time [s], by its rate now."""
+        """Return the rotation of a vehicle after a time [s] at its present rate."""
         q = bodies.quat_wb[row]
         return wp.quat_to_matrix(wp.normalize(q + quat_rate(q, bodies.rate_b[row]) * time))
 
-    # unrolled it takes ten times as long to compile
+    # with loops unrolled it would take ten times as long to compile
     @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
     def advance(
         # Params:

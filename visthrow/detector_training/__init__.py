@@ -1,4 +1,4 @@
-"""The training of the keypoint detector, and the renderer of the pictures that it learns from.
+"""Train the keypoint detector on rendered pictures.
 
-An optional room: nothing outside it imports it. The trained detector that flies is
-`camera.detectors.learnt`."""
+This room is optional: nothing outside it imports it. `camera.detectors.learnt` is the trained
+detector for flight."""

@@ -1,5 +1,5 @@
-"""``visthrow detector``: train the learnt keypoint detector on rendered frames, and throw on
-rendered pictures.
+"""``visthrow detector``: train the learnt keypoint detector on rendered frames, and throw with
+keypoints from rendered pictures.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from visthrow.common.arguments import declare
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import VisthrowError
 
-TOGETHER = 20  # throws in one process at a time
+TOGETHER = 20  # throws in a batch, which runs in one process
 
 CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "learnt.npz"
@@ -32,8 +32,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def throw(args: argparse.Namespace) -> int:
-    """Throw on pictures and print the landing errors; VisthrowError for no such plant, or a policy
-    that sees no keypoints.
+    """Throw with rendered pictures and print the landing errors.
+
+    Raises VisthrowError: the plant does not exist, or the policy is not a vision policy.
     """
     from visthrow.common.workers import done
     from visthrow.task.measurement import Throws
@@ -80,7 +81,7 @@ def throw(args: argparse.Namespace) -> int:
 def _throw_batch(
     loaded, plant: str, looks: dict[str, Any], job
 ) -> tuple[dict[str, np.ndarray], dict[str, int]]:
-    """Throws of one batch, in separate halls, and the numbers of frames with each detection."""
+    """Return the throws of one batch, each in its own hall, and the counts of detections."""
     from visthrow.detector_training.eyes import RenderedEyes
     from visthrow.detector_training.scenes.scene import Nuisances
     from visthrow.throws.reference_protocol import fly_batch
@@ -99,8 +100,9 @@ def _throw_batch(
 
 
 def train(args: argparse.Namespace) -> int:
-    """Train and write the weights; VisthrowError where the folder holds a training already, or none
-    to go on from.
+    """Train and write the weights.
+
+    Raises VisthrowError: the folder holds a training already, or none to resume.
     """
     from camera.params import CameraParams
     from visthrow.detector_training.fit_detector import Fit, FitParams

@@ -1,6 +1,4 @@
-"""Keypoints from rendered pictures: what a camera on each vehicle of a plant would take, and what a
-detector makes of it.
-"""
+"""Detect keypoints in rendered pictures from a camera on each vehicle of a plant."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,9 +31,9 @@ from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
 
-SURE = 0.5  # share of the looks in a hover in which ball and goal must be found
+SURE = 0.5  # lowest share of the pictures in a hover in which ball and goal must be detected
 
-THINGS = ("ball", "goal")  # what they look for
+THINGS = ("ball", "goal")  # objects to detect
 
 
 def render_hall(
@@ -49,8 +47,9 @@ def render_hall(
     """Render a grey hall with vehicle, ball and goal square.
 
     Args:
+        params: the camera.
         pos_w: position of the vehicle [m], shape (3,), world frame. rot_wb: its attitude, (3, 3).
-        ball_w, goal_w: positions [m], shape (3,), world frame. samples: rays a pixel.
+        ball_w, goal_w: positions [m], shape (3,), world frame. samples: rays for each pixel.
 
     Returns a picture, BGR, uint8, shape (H, W, 3).
     """
@@ -61,13 +60,13 @@ def render_hall(
 
 
 class RenderedEyes:
-    """A camera, a hall and a detector for each of E vehicles; the detector's training did not use
-    these halls.
+    """A camera, a hall and a detector for each of E vehicles; the halls were not used in the
+    detector's training.
 
     Attributes:
-        frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2),
-            validity (8,).
-        last_keypoints: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
+        frames: frames of the first vehicle with their detections: image, BGR; keypoints, (8, 2);
+            validity, (8,).
+        last_keypoints: keypoints and validity in the last pictures, (E, 8, 2) and (E, 8).
     """
 
     def __init__(
@@ -83,15 +82,16 @@ class RenderedEyes:
         weights: str | None = None,
         keep: bool = False,
     ):
-        """Draw the halls; ValueError for no weights, no photographs.
+        """Prepare renderer and detector. Raises ValueError: no weights, or no photographs.
 
         Args:
-            params: camera. rope: that the ball hangs on.
-            count: E. seed: of halls and sensors. device: of the renderer.
+            params: the camera. rope: the ball's rope.
+            count: number E of vehicles. seed: seed of halls and sensors.
+            device: device of the renderer.
             method: "learnt" or "contours".
-            samples: rays a pixel.
-            nuisances: left out, all. weights: of the learnt detector; left out, those that are
-                shipped. keep: whether frames are kept.
+            samples: rays for each pixel.
+            nuisances: severity of nuisances; default all. weights: file of the learnt detector;
+                default the shipped one. keep: whether to store frames.
         """
         self.params = params
         self.count = count
@@ -114,26 +114,26 @@ class RenderedEyes:
         self._followed: list[BallGoalTracker] = []
         self.frames: list[tuple[ndarray, Tensor, Tensor]] = []
         self.last_keypoints: tuple[ndarray, ndarray] | None = None
-        # looks of each vehicle in which it was found
+        # number of pictures of each vehicle in which the object was detected
         self._hits = {name: np.zeros(count, int) for name in THINGS}
         self._refused = 0
 
     @property
     def found(self) -> dict[str, int]:
-        """Counts of the finds of ball and goal, of frames, and of throws that were refused."""
+        """Return the counts of detections of ball and goal, of frames, and of refused throws."""
         hits = {name: int(hits.sum()) for name, hits in self._hits.items()}
         return hits | {"frames": self.count * self._looks, "refused": self._refused}
 
     def look(
         self, snapshot: Any, measured: Any, goal_w: ndarray, carried: Sequence[bool] | ndarray
     ) -> tuple[ndarray, ndarray]:
-        """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8,
-        2), and validity, shape (E, 8).
+        """Render and process a picture for each vehicle; return normalised keypoints, float32,
+        shape (E, 8, 2), and validity, shape (E, 8).
 
         Args:
-            snapshot: truth, a `visthrow.throws.plants.Snapshot`.
-            measured: likewise, as poses report it; attitude and height help the detector.
-            goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
+            snapshot: true state, a `visthrow.throws.plants.Snapshot`.
+            measured: measured state, whose attitude and height support the detector.
+            goal_w: goals [m], shape (E, 3). carried: whether a payload is attached, shape (E,).
         """
         scenes = self._scenes(snapshot, goal_w, np.asarray(carried))
         pictures = self.renderer.render(scenes, self._looks).cpu().numpy()
@@ -157,8 +157,8 @@ class RenderedEyes:
         return points, valid
 
     def lost(self) -> dict[int, str]:
-        """Return, by vehicle, which of ball and goal was detected too seldom for a throw; called in
-        a hover.
+        """Return vehicle -> the object, ball or goal, that was detected too rarely for a throw;
+        called in a hover.
         """
         lost = {
             int(e): name
@@ -169,7 +169,7 @@ class RenderedEyes:
         return lost
 
     def _assume_hanging_ball(self, rot_wb: ndarray) -> BallGoalTracker:
-        """Return a ball that hangs still below a vehicle: where it is looked for first."""
+        """Return a tracker that starts with a ball at rest below the vehicle."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
         return BallGoalTracker(
             self.params.payload_radius, self.params.goal_side, from_lens - [0.0, 0.0, self._below]
@@ -184,8 +184,8 @@ class RenderedEyes:
         carried: bool,
         stamp: float,
     ) -> FrameDetections:
-        """Return the detections, with a missed ball where it is predicted; vehicle e and
-        its measured pose at a time [s].
+        """Return the detections of vehicle ``e``, with a missed ball at its predicted position; the
+        pose is measured at the time ``stamp`` [s].
         """
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
         eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
@@ -197,8 +197,8 @@ class RenderedEyes:
         return self._followed[e].take(detections, rot_wc, stamp)
 
     def sheet(self, path: Path) -> Path:
-        """Draw six of the kept frames, spread over the throw, with what was found; returns the
-        path.
+        """Draw six of the stored frames, evenly spaced over the throw, with their detections;
+        return the path.
         """
         import cv2
 
@@ -213,7 +213,7 @@ class RenderedEyes:
         return path
 
     def _scenes(self, snapshot: Any, goal_w: ndarray, carried: ndarray) -> Scenes:
-        """Return the halls with vehicles, balls and squares where they are."""
+        """Return the halls with vehicles, balls and goal squares at their present positions."""
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
         rot = rotation_from_quat(tensor(snapshot.quat_wb))
         plain = make_plain_scenes(

@@ -1,9 +1,8 @@
-"""Training of the learnt detector on rendered frames, on the CPU or a GPU, and the calibration of
-its confidences.
+"""Train the learnt detector on rendered frames, on the CPU or a GPU, and calibrate its confidences.
 
-Frames are rendered as the training goes, into a pool that forgets the oldest; each step takes some
-of the pool. Where rendering is cheap (a GPU) every frame is new. kornia varies colours and
-sharpness once more, on the device."""
+Frames are rendered during the training into a pool from which the oldest are dropped; each step
+uses some frames of the pool. If rendering is cheap (on a GPU) every frame is new. In addition,
+kornia varies colours and sharpness on the device."""
 
 import math
 import time
@@ -46,27 +45,27 @@ from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
 Count = Annotated[int, Bound(1.0)]
-STATES = ("networks", "optimizer", "rates")  # of a `Fit`, in its checkpoint
-MATCH_RADIUS = 0.5  # a finding within this many sizes of the thing is of it
+STATES = ("networks", "optimizer", "rates")  # attributes of a `Fit` in its checkpoint
+MATCH_RADIUS = 0.5  # largest distance of a correct detection, in sizes of the object
 
 
 @dataclass(frozen=True)
 class FitParams(Bounded):
-    """A training; one file of ``configs/detector``.
+    """Parameters of a training; a file of ``configs/detector``.
 
     Raises ValueError: a count below 1, or more fresh frames than the pool holds.
     """
 
     steps: Count
-    batch: Count  # frames a step
-    patches: Count  # of each kind a step
-    fresh: Count  # frames rendered at a time
-    reuse: Count  # steps between two renderings
-    pool: Count  # frames that are kept
-    samples: Count  # rays a pixel
-    learning_rate: Positive  # at its highest; one cycle
-    lenses: Share  # share of rendered batches with another lens than the camera's
-    calibration: Count  # frames that confidences are calibrated on
+    batch: Count  # frames in a step
+    patches: Count  # patches of each kind in a step
+    fresh: Count  # frames in a rendered batch
+    reuse: Count  # steps between rendered batches
+    pool: Count  # capacity of the pool, in frames
+    samples: Count  # rays for each pixel
+    learning_rate: Positive  # the highest one, of a one-cycle schedule
+    lenses: Share  # share of rendered batches with a different lens than the camera's
+    calibration: Count  # frames for the calibration of confidences
     seed: int
 
     def __post_init__(self) -> None:
@@ -79,16 +78,17 @@ class FitParams(Bounded):
 
 
 def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> TensorDict:
-    """Labels of F frames: their true places, float32 unless stated.
+    """Return the labels of F frames, their true positions, float32 unless stated.
 
-    ``rays`` by kind, unit ray to the middle, shape (F, 3); ``sizes`` by kind [rad], shape (F,);
-    ``visible`` by kind, whole in view, shape (F,), bool; ``corners``, unit rays, shape (F, 4, 3);
-    ``north``, the world's x in the camera frame, shape (F, 3); ``distractor``, unit ray to
-    something else, shape (F, 3).
+    ``rays`` by kind: unit ray to the centre, shape (F, 3); ``sizes`` by kind [rad], shape (F,);
+    ``visible`` by kind: whether the whole object is in view, shape (F,), bool; ``corners``: unit
+    rays, shape (F, 4, 3); ``north``: the world's x axis in the camera frame, shape (F, 3);
+    ``distractor``: unit ray to another object, shape (F, 3).
 
     Args:
-        truth: of their scenes. things_c: place of one other thing [m], shape (F, 3), camera frame.
-        radius: of the ball [m]. device: where they go.
+        truth: true positions in the scenes.
+        things_c: position of another object [m], shape (F, 3), camera frame.
+        radius: radius of the ball [m]. device: device of the labels.
     """
     corners = F.normalize(truth.corners_c, dim=-1)
     middle = F.normalize(corners.mean(1), dim=-1)
@@ -109,7 +109,7 @@ def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Ten
 
 
 def draw_lens(lens, generator: torch.Generator):
-    """Return a lens like this one with another scale and a bend, its picture of the same size."""
+    """Return a variant of a lens with random scale and distortion and the same picture size."""
     scale = (1.0 + 0.35 * torch.rand(1, generator=generator)).item()
     bend = (0.06 * torch.rand(1, generator=generator) - 0.04).item()
     reach = 0.98 * min(lens.width, lens.height) / 2.0 / (lens.fx * scale)
@@ -124,7 +124,7 @@ def draw_lens(lens, generator: torch.Generator):
 def render_frames(
     camera: CameraParams, renderer: Renderer, count: int, seed: int
 ) -> tuple[Tensor, TensorDict, Fisheye]:
-    """Frames of random scenes, their labels and their lens."""
+    """Render frames of random scenes; return frames, labels and lens."""
     lens = Fisheye(camera.fisheye)
     scenes = random_scenes(camera, renderer.textures, count, seed)
     row = lens_row(camera.fisheye)[:9].expand(count, -1)
@@ -140,8 +140,10 @@ def render_frames(
 
 
 def search_loss(grids: Tensor, labels: TensorDict, lens: Fisheye) -> Tensor:
-    """Loss of places, after Zhou et al., "Objects as Points", 2019: focal about a soft peak; place
-    and size at the peak's cell.
+    """Return the loss of the search: a focal loss around a soft peak, and errors of position and
+    size in the peak's cell.
+
+    Source: Zhou et al., "Objects as Points", 2019.
     """
     total = grids.new_zeros(())
     (height, width) = grids.shape[-2:]
@@ -163,7 +165,7 @@ def search_loss(grids: Tensor, labels: TensorDict, lens: Fisheye) -> Tensor:
         )
         logits = grids[:, k, 0]
         probability = logits.sigmoid().clamp(1e-5, 1 - 1e-5)
-        cut = visible & ~present  # half in view: neither a place nor none
+        cut = visible & ~present  # partly in view: neither a positive nor a negative example
         counts = 1.0 - (cut[:, None, None] & (distance < 9.0)).float()
         negative = -((1 - soft) ** 4 * probability**2 * (1 - probability).log() * counts).sum(
             (1, 2)
@@ -181,12 +183,13 @@ def search_loss(grids: Tensor, labels: TensorDict, lens: Fisheye) -> Tensor:
 def looks(
     kind: str, labels: TensorDict, count: int, peaks: tuple[Tensor, Tensor], generator
 ) -> tuple[Tensor, ...]:
-    """Places to look at: frame, ray, size; half of them about the thing, the others at other
-    things, anywhere, or where the search erred.
+    """Return patches to examine, frame index, ray and size: half of them near the object, the
+    others at other objects, at random, or at a peak of the search.
 
     Args:
-        kind: of the thing. labels: of the frames. count: of places.
-        peaks: of the search, rays (F, 3) and sizes (F,). generator: on the labels' device.
+        kind: kind of the object. labels: labels of the frames. count: number of patches.
+        peaks: peaks of the search, rays (F, 3) and sizes (F,).
+        generator: random generator on the labels' device.
     """
     device = labels["corners"].device
     draw = lambda *shape: torch.randn(*shape, generator=generator, device=device)  # noqa: E731
@@ -208,8 +211,8 @@ def looks(
 def offsets(
     kind: str, views: Views, detections: Tensor, labels: TensorDict, index: Tensor
 ) -> Tensor:
-    """Return the error of detections in half sides; of a ball the last column is of its
-    log size.
+    """Return the errors of detections in half sides of the patch; for a ball the last column is the
+    weighted error of the logarithm of its size.
     """
     if kind == "ball":
         size = (labels["sizes", "ball"][index] * REACH["ball"] / views.reach).log()
@@ -227,10 +230,10 @@ def offsets(
 
 
 class Fit:
-    """A training.
+    """A training of the detector.
 
     Attributes:
-        step: steps done. networks: as they are.
+        step: number of finished steps. networks: the current networks.
     """
 
     def __init__(
@@ -243,8 +246,8 @@ class Fit:
         """Start with untrained networks.
 
         Args:
-            params: of the training. camera: that they will look through.
-            device: "cpu" or "cuda:0". files: photographs; left out, those of the training.
+            params: parameters of the training. camera: the camera of the pictures.
+            device: "cpu" or "cuda:0". files: photographs; default those for training.
         """
         import kornia.augmentation as augmentations
 
@@ -254,7 +257,7 @@ class Fit:
         self.device = device
         self.networks = Networks().to(device)
         self.renderer = Renderer(camera.fisheye, device, files, params.samples)
-        # frames, their labels and their lens, the oldest first
+        # frames with labels and lens, the oldest first
         self.pool = deque(maxlen=max(params.pool // params.fresh, 1))
         self.optimizer = torch.optim.AdamW(
             self.networks.parameters(), params.learning_rate, weight_decay=1e-4
@@ -271,11 +274,11 @@ class Fit:
         self.step = 0
 
     def augment(self, pictures: Tensor) -> Tensor:
-        """Pictures in -1 to 1 with other colours, blur and noise."""
+        """Return pictures, -1 to 1, with random changes of colour, blur and noise."""
         return self._vary((pictures + 1.0) * 0.5) * 2.0 - 1.0
 
     def advance(self) -> dict[str, float]:
-        """One step; returns its losses."""
+        """Do one training step and return its losses."""
         p = self.params
         seed = p.seed * 7_000_003 + self.step
         generator = torch.Generator(self.device).manual_seed(seed)
@@ -301,7 +304,7 @@ class Fit:
         return {name: float(value.detach()) for name, value in losses.items()}
 
     def _render(self) -> tuple[Tensor, TensorDict, Fisheye]:
-        """Render the fresh frames of this step."""
+        """Render new frames for the pool."""
         p = self.params
         seed = p.seed * 1_000_003 + self.step
         generator = torch.Generator().manual_seed(seed)
@@ -313,8 +316,8 @@ class Fit:
     def look_loss(
         self, kind: str, frames: Tensor, labels: TensorDict, lens: Fisheye, places, generator
     ) -> Tensor:
-        """Loss of one kind's close looks: whether the thing is there, where and how large, and how
-        far off that is.
+        """Return the loss of patches of one kind: presence of the object, position, size, and
+        predicted accuracy.
         """
         index, ray, size = places
         north = labels["north"][index] + 0.15 * torch.randn(
@@ -340,7 +343,7 @@ class Fit:
         else:
             error = off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
         spread = outputs[:, 1].clamp(-8.0, 3.0)
-        # of a Laplace distribution
+        # negative log likelihood of a Laplace distribution
         accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread
         present = present.float()
         return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
@@ -351,12 +354,12 @@ class Fit:
         until: float = math.inf,
         saved: Path | None = None,
     ) -> bool:
-        """Train to the end or to a time; whether it is done.
+        """Train to the end or up to a time; return whether the training is finished.
 
         Args:
-            tell: called with step and losses now and then.
-            until: on `time.monotonic` [s].
-            saved: checkpoint, written now and then and at the end.
+            tell: called with step and losses, periodically.
+            until: time limit on `time.monotonic` [s].
+            saved: checkpoint, written periodically and at the end.
         """
         begin = time.monotonic()
         while self.step < self.params.steps and time.monotonic() < until:
@@ -378,22 +381,22 @@ class Fit:
         part.replace(path)
 
     def load(self, path: Path) -> None:
-        """Take up a checkpoint; the pool is filled anew.
+        """Restore a checkpoint; the pool starts empty.
 
-        Raises ValueError: no checkpoint of such a training.
+        Raises ValueError: the file is not a checkpoint of such a training.
         """
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
             for name in STATES:
                 getattr(self, name).load_state_dict(saved[name])
             self.step = saved["step"]
-        except Exception as error:  # of a file that is none, torch raises what its bytes lead to
+        except Exception as error:  # torch raises various errors for other files
             raise ValueError(f"{path}: no checkpoint of this training: {error}") from error
 
     @torch.no_grad()
     def calibrate(self) -> dict[str, dict[str, float]]:
-        """Fit the probabilities and the accuracies to what becomes of findings in frames that were
-        not trained on; returns figures.
+        """Calibrate probabilities and accuracies on detections in frames that were not used for
+        training; return the figures.
         """
         self.networks.eval()
         samples = {kind: [] for kind in KINDS}
@@ -431,8 +434,8 @@ class Fit:
 def findings(
     networks: Networks, frame: Tensor, labels: TensorDict, lens: Fisheye
 ) -> dict[str, Tensor]:
-    """Score the places of one frame: logit, whether it is of the thing, error [rad], predicted
-    accuracy [rad]; a row each.
+    """Score the detections in one frame, one row for each: logit, whether it is correct, error
+    [rad], predicted accuracy [rad].
     """
     places = places_of(networks.search(halve(frame)), lens)
     scores = {}
@@ -445,7 +448,8 @@ def findings(
         size = labels["sizes", kind]
         visible = labels["visible", kind]
         hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
-        clear = visible | (error > 2.0 * size)  # else half in view
+        # neither correct nor near the object, which may be partly in view
+        clear = visible | (error > 2.0 * size)
         if kind == "goal":
             first = corners_of(views, out)[:, 0:1]
             error = _angle_between(first, labels["corners"]).amin(-1)
@@ -455,7 +459,7 @@ def findings(
 
 
 def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
-    """Factor and offset of logits that make them probabilities.
+    """Return factor and offset that calibrate logits as probabilities.
 
     Source: Platt, "Probabilistic outputs for support vector machines", 1999, with a weak prior at 1
     and 0."""
@@ -471,14 +475,14 @@ def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
 
 
 def _angle_between(rays: Tensor, references: Tensor) -> Tensor:
-    """Angles between unit rays [rad], exact for small ones."""
+    """Return the angles between unit rays [rad], accurate for small angles."""
     sine = torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1)
     return torch.atan2(sine, (rays * references).sum(-1))
 
 
 def _peaks(grids: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
-    """Ray and size of one of the three likeliest cells of each frame, of grids (F, 4, h, w) of one
-    kind.
+    """Return ray and size of a random one of the three likeliest cells in each frame, for grids
+    (F, 4, h, w) of one kind.
     """
     best = grids[:, 0].flatten(1).topk(3, dim=1).indices
     best = best.gather(1, torch.randint(3, (len(best), 1), device=best.device))[:, 0]

@@ -1,7 +1,7 @@
-"""The paper's results made again: baseline, sweeps of trainings, report, and the committed records.
+"""Reproduce the paper's results: baseline, sweeps of trainings, report, and the committed records.
 
-An optional room: nothing outside it imports it. Records of speed are in `records/bench`, of
-accuracy in `records`, each with its command and commit; `visthrow bench records` prints them."""
+This room is optional: nothing outside it imports it. Records of speed are in `records/bench`, those
+of accuracy in `records`, each with its command and commit; `visthrow bench records` prints them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Recorded measurements of speed, each with its command, commit and machine: read, and put in
+"""Read recorded measurements of speed, each with command, commit and machine, and convert them to
 Markdown.
 """
 
@@ -11,17 +11,17 @@ from visthrow.view.parts import align
 
 FOLDER = Path(__file__).with_name("records") / "bench"
 PAGES = Path(__file__).with_name("records") / "pages"
-"""Figures that pages of an earlier commit held, beside what the pages hold now."""
+"""Figures from pages of an earlier commit, in addition to those on the present pages."""
 PAGE_KEYS = {"title", "source", "tables", "notes"}
 KEYS = {"bench", "title", "provenance", "tables", "notes", "figures"}
-"""Of every record.
+"""Keys of every record.
 
-One that another version measured has the command of today besides, ``today``.
+A record of another version also has ``today``, the present command.
 """
 
 
 def body(record: dict[str, Any]) -> str:
-    """Title, tables and notes of a record as Markdown."""
+    """Return title, tables and notes of a record as Markdown."""
     tables = [
         f"**{table['title']}**\n\n{align(table['header'], table['rows'])}"
         for table in record["tables"]
@@ -32,12 +32,12 @@ def body(record: dict[str, Any]) -> str:
 
 
 def record_paths() -> list[Path]:
-    """Return the files of all shipped records: of programs, then of pages."""
+    """Return the files of all shipped records: those of programs, then those of pages."""
     return [*sorted(FOLDER.glob("*.json")), *sorted(PAGES.glob("*.json"))]
 
 
 def origin(record: dict[str, Any]) -> str:
-    """Provenance of a record in a few lines of Markdown."""
+    """Return the provenance of a record in a few lines of Markdown."""
     if "source" in record:
         return f"From {record['source']}."
     provenance = record["provenance"]
@@ -50,16 +50,14 @@ def origin(record: dict[str, Any]) -> str:
 
 
 def provenance_of(record: dict[str, Any]) -> str:
-    """Command, time and commit of a record, and the command that measures it today where that is
-    another.
-    """
+    """Return command, time and commit of a record, and the present command if it differs."""
     provenance = record["provenance"]
     text = f"`{provenance['command']}`, {provenance['time']}, commit {provenance['commit'][:12]}"
     return f"{text}; today, from a clone: `{record['today']}`" if record.get("today") else text
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a record; StorageError where it is no JSON, or keys are missing."""
+    """Read a record. Raises StorageError: it is not JSON, or keys are missing."""
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

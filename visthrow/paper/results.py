@@ -1,10 +1,10 @@
-"""Results of throws as units of work: what goes in is named and hashed, what comes out is one small
-file, or a packed record.
+"""Units of work and their results: the inputs of throws are named and hashed, and the results are
+written to one small file for each unit, or to a packed record.
 
-A unit is a flat description of everything that its throws depend on (:func:`policy_unit` and the
-like). Its key is a hash of that, so that a changed input is another unit and an unchanged one is
-never worked twice. Each unit is written whole when it is done: a process killed at any moment loses
-no more than the units that it was working on."""
+A unit is a flat description of everything that its throws depend on (for instance
+:func:`policy_unit`). Its key is a hash of the description, so that a changed input yields a
+different unit, and an unchanged unit is never done twice. Each result is written as a whole when it
+is done: a process that is killed loses only the units in progress."""
 
 import hashlib
 import json
@@ -24,23 +24,23 @@ from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import done
 
-# goes up when the same unit would come out otherwise: an older result is then no longer used
+# increased when the same unit would yield a different result; older results are then not used
 PROTOCOL = 1
 
-DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by
+DIGITS = 4  # decimal places in SI units: 0.1 mm, a hundredth of the throws' scatter
 
 Unit = dict[str, Any]
-"""All that throws depend on: name -> value, plain numbers, texts and lists."""
+"""Everything that throws depend on: name -> value (numbers, texts and lists)."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Throws of one unit.
+    """The throws of one unit.
 
-    Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m],
-    ``duration`` [s] and further measurements; NaN where a throw failed."""
+    Columns have one row for each throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error``
+    [m], ``duration`` [s] and further measurements; NaN where a throw failed."""
 
-    unit: Unit  # what they depend on
+    unit: Unit  # everything that the throws depend on
     columns: dict[str, ndarray]
     # commit, command, time [UTC], seconds of work
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -48,12 +48,12 @@ class Result:
 
     @property
     def key(self) -> str:
-        """Key of the unit."""
+        """Return the key of the unit."""
         return key_of(self.unit)
 
     @property
     def good(self) -> ndarray:
-        """Throws that landed, shape (N,), bool."""
+        """Return whether each throw landed, shape (N,), bool."""
         return self.columns["success"].astype(bool)
 
     def of(self, name: str) -> ndarray:
@@ -62,8 +62,8 @@ class Result:
 
     @property
     def miss(self) -> ndarray:
-        """Landing points of the successful throws from the target, or where it was at impact [m],
-        shape (N, 2): along x, to the left.
+        """Return the landing points of successful throws relative to the target's position at
+        impact [m], shape (N, 2): along x, and to the left.
         """
         if "goal_w" in self.columns:
             goal = self.of("goal_w")
@@ -73,12 +73,12 @@ class Result:
 
 
 def key_of(unit: Unit) -> str:
-    """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
+    """Return the hash of a unit, 16 hexadecimal digits, independent of the order of its entries."""
     return _digest(json.dumps(unit, sort_keys=True, allow_nan=False).encode())
 
 
 def hash_of(path: str | Path) -> str:
-    """Hash of a file's content: 16 hexadecimal digits."""
+    """Return the hash of a file's content, 16 hexadecimal digits."""
     return _digest(Path(path).read_bytes())
 
 
@@ -100,16 +100,15 @@ def policy_unit(
     train_seed: int | None = None,
     departures: dict[str, Any] | None = None,
 ) -> Unit:
-    """Return the unit of so many throws with a learnt policy at a target [m] along x.
+    """Return a unit of throws with a learnt policy at a target [m] along x.
 
     Args:
-        policy, weights: what it is called, and :func:`hash_of` its file.
-        layout, plant: "state" or "vision"; of :data:`visthrow.throws.plants.PLANTS`.
-        target, throws, seed: of starts and noise.
-        run, train_seed: config and seed of its training.
-        variant: "full", or the name of what the training lacked or had more of.
-        departures: config key -> value, where the throws are flown under other conditions than the
-            policy's own.
+        policy: name of the policy. weights: :func:`hash_of` its file.
+        layout: "state" or "vision". plant: name in :data:`visthrow.throws.plants.PLANTS`.
+        target: distance [m]. throws: number of throws. seed: seed of initial states and noise.
+        run, train_seed: config and seed of the policy's training.
+        variant: "full", or the name of the difference of the training from the full one.
+        departures: config key -> value, for conditions that differ from the policy's own.
     """
     return {
         "kind": "policy",
@@ -129,8 +128,8 @@ def policy_unit(
 
 
 def columns_of(throws: Any) -> dict[str, ndarray]:
-    """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`,
-    :class:`visthrow.paper.baseline.fly_plan.Flown`).
+    """Return the arrays with one row for each throw of a dataclass of throws
+    (:class:`visthrow.task.measurement.Throws`, :class:`visthrow.paper.baseline.fly_plan.Flown`).
     """
     count = len(throws.success)
     columns = {}
@@ -153,8 +152,9 @@ def write_line(path: str | Path, value: Any) -> None:
 
 
 def load(path: str | Path) -> list[Result]:
-    """Read the results of one file, a single one or a packed record; StorageError where it is no
-    such file.
+    """Read the results in a file, a single one or a packed record.
+
+    Raises StorageError: it is not such a file.
     """
     try:
         value = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -166,7 +166,7 @@ def load(path: str | Path) -> list[Result]:
 
 
 def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
-    """Read all results in folders and files, by key; of two with one key the later place counts."""
+    """Read all results in folders and files, by key; for equal keys the later place counts."""
     results: dict[str, Result] = {}
     for place in map(Path, places):
         files = sorted(place.glob("*.json"))
@@ -178,10 +178,10 @@ def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
 
 
 def join(results: Iterable[Result]) -> list[Result]:
-    """Put the batches of one set of throws together: units that differ in nothing but ``batch`` and
-    its size, in order.
+    """Join the batches of each set of throws, units that differ only in ``batch`` and its size, in
+    order.
 
-    Of two results for one batch the larger counts. Units without a batch stay as they are.
+    Of two results for the same batch the larger counts. Units without a batch are unchanged.
     """
     whole: list[Result] = []
     groups: dict[str, dict[int, Result]] = {}
@@ -212,7 +212,7 @@ def _join(group: list[Result]) -> Result:
 
 
 def pack(results: Iterable[Result], path: str | Path) -> None:
-    """Write results into one file, sorted by what they are, so that the same results give the same
+    """Write results into one file, sorted by their units, so that the same results yield the same
     file.
     """
     ordered = sorted(results, key=lambda result: json.dumps(result.unit, sort_keys=True))
@@ -230,14 +230,15 @@ def work(
     processes: int = 1,
     say: Callable[[str], None] = lambda text: None,
 ) -> dict[str, Result]:
-    """Do what the folder does not hold yet, in order, in so many processes at once; returns the
-    results of all units by key.
+    """Do the units whose results are not in the folder, in order; return the results of all units
+    by key.
 
     Args:
-        units, folder: the requested units, and where each result is written when it is done.
-        function: of a unit, importable by its name; returns columns and extra figures.
+        units: the requested units.
+        folder: folder for the results, which are written as they finish.
+        function: function of a unit that returns columns and extra figures, importable by its name.
         recorded: results from elsewhere, by key; they count as done.
-        processes, say: 1 works in this one; receives the progress.
+        processes: number of parallel processes; 1 for this one. say: receives progress messages.
     """
     results = {**load_all([folder]), **(recorded or {})}
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
@@ -251,9 +252,7 @@ def work(
 
 
 def finish(folder: str | Path, function: Callable, commit: str, command: str, unit: Unit) -> Result:
-    """Do one unit as :func:`work` does, and write its result with commit, command, time and
-    seconds.
-    """
+    """Do one unit and write its result with commit, command, time and duration."""
     begin = time.perf_counter()
     columns, extra = function(unit)
     origin = {

@@ -1,3 +1,3 @@
-"""A batched renderer of what the fisheye camera sees of a hall, on Warp, and the random scenes that
-a detector is trained on.
+"""A batched renderer of fisheye pictures of a hall, on Warp, and random scenes for the training of
+a detector.
 """

@@ -1,4 +1,4 @@
-"""Pictures of scenes, on Warp: CPU or CUDA, the same seed the same bits on one device."""
+"""Render pictures of scenes with Warp, on CPU or CUDA; reproducible to the bit on a device."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,7 +11,7 @@ from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 
 class Renderer:
-    """Renders batches of scenes of one size of picture.
+    """A renderer of batches of scenes with a fixed picture size.
 
     Attributes:
         textures: number of photographs.
@@ -27,9 +27,9 @@ class Renderer:
         """Load the photographs. Raises ValueError: no photographs.
 
         Args:
-            lens: size of the pictures. device: "cpu" or "cuda:0".
-            files: photographs; left out, those of the training; without any, scenes are plain.
-            samples: rays a pixel.
+            lens: lens with the size of the pictures. device: "cpu" or "cuda:0".
+            files: photographs; default those for training; with an empty list scenes are plain.
+            samples: rays for each pixel.
         """
         import warp as wp
 
@@ -44,11 +44,11 @@ class Renderer:
         self._pixels = wp.array(pixels, dtype=wp.uint8, device=device)
 
     def render(self, scenes: Scenes, seed: int = 0) -> torch.Tensor:
-        """Pictures, RGB, uint8, shape (E, H, W, 3), on the renderer's device.
+        """Return pictures, RGB, uint8, shape (E, H, W, 3), on the renderer's device.
 
         Args:
-            scenes: rows of `Scenes`; texture -1 is plain grey.
-            seed: of the samples and the sensor's noise.
+            scenes: the scenes; texture -1 is plain grey.
+            seed: seed of the samples and of the sensor's noise.
         """
         import warp as wp
 
@@ -62,7 +62,7 @@ class Renderer:
         things = things.float().contiguous()
 
         def rows(tensor: torch.Tensor, struct: type) -> wp.array:
-            """View of a tensor whose last axis holds the numbers of a struct."""
+            """Return a view of a tensor whose last axis holds the fields of a struct."""
             shape = tensor.shape[:-1]
             return wp.array(ptr=tensor.data_ptr(), dtype=struct, shape=shape, device=device)
 
@@ -78,7 +78,7 @@ class Renderer:
             wp.synchronize_device(device)
             return image
         wp.load_module(device=device, module="visthrow.detector_training.scenes.scene_kernel")
-        # Warp runs a launch on the CPU in the thread that asks for it
+        # on the CPU, Warp runs a launch in the calling thread
         share = -(-scenes.count // torch.get_num_threads())
         parts = (slice(first, first + share) for first in range(0, scenes.count, share))
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:

@@ -1,4 +1,4 @@
-"""Scenes of a throw: what is drawn, at random or by a flight, and where its keypoints are in the
+"""Scenes of throws, random or from a flight, and the true positions of their keypoints in the
 picture.
 """
 
@@ -17,10 +17,10 @@ from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
 from visthrow.common.toml_text import tables_beside
 
-THINGS = 10  # most things on the ground and about the hall
+THINGS = 10  # largest number of other objects in a hall
 
 ALIKE = ((0.75, 0.80, 0.25), (0.20, 0.50, 0.28), (0.85, 0.75, 0.20), (0.9, 0.9, 0.88))
-"""Colours of things like the ball's or the square's."""
+"""Colours of objects that resemble those of the ball or the square."""
 
 
 def _table(name: str) -> dict[str, Any]:
@@ -28,15 +28,17 @@ def _table(name: str) -> dict[str, Any]:
 
 
 ROW_COLUMNS = _table("rows.toml")
-"""Table of :class:`Scenes` -> its columns and their types; the last one's rows are things."""
+"""Table of :class:`Scenes` -> its columns and their types; the last one is a row of ``things``."""
 
 PLAIN = _table("plain.toml")
-"""Numbers of plain scenes: rows of :class:`Scenes`, or what follows a scene's own numbers there."""
+"""Rows of plain scenes in the tables of :class:`Scenes`, or the columns after the scene's
+values.
+"""
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of scenes, a row each, float32; `rows.toml` describes the columns."""
+    """A batch of scenes, one row for each, float32; `rows.toml` describes the columns."""
 
     lens: Tensor
     pose: Tensor
@@ -52,7 +54,7 @@ class Scenes:
 
     @property
     def count(self) -> int:
-        """Number of scenes E."""
+        """Return the number E of scenes."""
         return len(self.pose)
 
     def to(self, device: str | torch.device) -> "Scenes":
@@ -61,65 +63,68 @@ class Scenes:
 
 
 def lens_row(lens: FisheyeParams, vignetting: float = 0.5) -> Tensor:
-    """Row of a lens, shape (10,)."""
+    """Return the row of a lens, shape (10,)."""
     return torch.tensor(
         [lens.fx, lens.fy, lens.cx, lens.cy, *lens.coefficients, lens.half_fov, vignetting]
     )
 
 
 class Draw:
-    """Random numbers of one batch, on the CPU: the same seed draws the same on every device."""
+    """A source of random numbers for one batch, on the CPU, so that they are the same for all
+    devices.
+    """
 
     def __init__(self, count: int, seed: int):
-        """Start a batch."""
+        """Prepare for a batch of ``count`` scenes."""
         self.count = count
         self.generator = torch.Generator().manual_seed(seed)
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
-        """Uniform numbers, shape (E, ...)."""
+        """Return uniform numbers, shape (E, ...)."""
         return low + (high - low) * torch.rand(self.count, *shape, generator=self.generator)
 
     def normal(self, std: float, *shape: int) -> Tensor:
-        """Return the normal numbers, shape (E, ...)."""
+        """Return normal numbers, shape (E, ...)."""
         return std * torch.randn(self.count, *shape, generator=self.generator)
 
     def one_of(self, count: int, *shape: int) -> Tensor:
-        """Whole numbers below ``count``, float, shape (E, ...)."""
+        """Return whole numbers below ``count``, float, shape (E, ...)."""
         return torch.randint(0, count, (self.count, *shape), generator=self.generator).float()
 
     def chance(self, share: float, *shape: int) -> Tensor:
-        """Bits that are set with a probability, shape (E, ...)."""
+        """Return booleans that are true with a probability, shape (E, ...)."""
         return torch.rand(self.count, *shape, generator=self.generator) < share
 
     def way(self) -> Tensor:
-        """Horizontal unit vectors, shape (E, 2)."""
+        """Return horizontal unit vectors, shape (E, 2)."""
         angle = self.uniform(0.0, 2.0 * math.pi)
         return torch.stack([angle.cos(), angle.sin()], -1)
 
 
 @dataclass(frozen=True)
 class Nuisances:
-    """The severity of nuisances: 1 is all that a hall and a cheap camera do, 0 none."""
+    """The severity of nuisances, from 0 (none) to 1 (as in a hall with a cheap camera)."""
 
     blur: float = 1.0
     motion: float = 1.0  # exposure and rolling shutter
     noise: float = 1.0
     light: float = 1.0
     clutter: float = 1.0
-    ground: float = 1.0  # textures, else grey
+    ground: float = 1.0  # textures instead of grey
     look: float = 1.0  # colours of ball and square
-    parts: float = 1.0  # rope before the lens
+    parts: float = 1.0  # rope in front of the lens
 
 
 def random_scenes(
     params: CameraParams, textures: int, count: int, seed: int, nuisances: Nuisances | None = None
 ) -> Scenes:
-    """Draw moments of throws: hanging or thrown ball, level or steep vehicle, goal within 2.3 m.
+    """Draw random instants of throws: hanging or thrown ball, level or tilted vehicle, goal within
+    2.3 m.
 
     Args:
         params: camera, with the sizes of ball and square.
-        textures: number of photographs. count: E. seed: of all.
-        nuisances: of the pictures; left out, all.
+        textures: number of photographs. count: number E of scenes. seed: seed of all draws.
+        nuisances: severity of nuisances; default all.
     """
     d = Draw(count, seed)
     ahead = d.uniform(-0.4, 1.0, 1)
@@ -154,14 +159,14 @@ def make_plain_scenes(
     goal_w: Tensor,
     hangs: Tensor,
 ) -> Scenes:
-    """Plain scenes at poses: grey ground, tennis ball, green square with a white rim, a sharp and
-    quiet picture.
+    """Return plain scenes for given poses: grey ground, tennis ball, green square with a white rim,
+    a sharp picture without noise.
 
     Args:
         params: camera.
-        pos_w: of the vehicle [m], shape (E, 3). rot_wb: attitude, shape (E, 3, 3).
-        ball_w: [m], shape (E, 3). goal_w: [m], shape (E, 2) or (E, 3). hangs: whether the ball is
-            on its rope, shape (E,).
+        pos_w: position of the vehicle [m], shape (E, 3). rot_wb: attitude, shape (E, 3, 3).
+        ball_w: [m], shape (E, 3). goal_w: [m], shape (E, 2) or (E, 3).
+        hangs: whether the ball is attached to its rope, shape (E,).
     """
     count = len(pos_w)
     plain = {name: torch.tensor(row).float().repeat(count, 1) for name, row in PLAIN.items()}
@@ -184,13 +189,13 @@ def make_plain_scenes(
 
 
 def _flat(*columns: Tensor) -> Tensor:
-    """Join columns, shape (F, ...) or (F, ..., n)."""
+    """Concatenate columns, shape (F, ...) or (F, ..., n)."""
     rank = max(2, *(c.dim() for c in columns))
     return torch.cat([c if c.dim() == rank else c[..., None] for c in columns], -1)
 
 
 def _draw_sensors(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
-    """Return sensors and shutters drawn at random."""
+    """Return random sensors and shutters."""
     gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
     noise = n.noise * d.uniform(0.0, 1.0).square()
     seed = torch.arange(count) * 7919.0 + d.one_of(1000)
@@ -203,7 +208,7 @@ def _draw_sensors(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
 
 
 def _draw_colours(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
-    """Return balls and goals with colours, sizes and turns drawn at random."""
+    """Return balls and goals with random colours, rims, marks and orientations."""
     ball = scenes.ball.clone()
     goal = scenes.goal.clone()
     ball[:, 7:11] = F.normalize(d.normal(1.0, 4), dim=-1)
@@ -213,7 +218,7 @@ def _draw_colours(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor
     ):
         shade = d.uniform(*shades, 1)
         hue = shade + d.uniform(-0.08, 0.08, 3)
-        edge = d.uniform(*edges, 1)  # of the ball's seam, of the square's rim
+        edge = d.uniform(*edges, 1)  # brightness of the ball's seam or the square's rim
         change = torch.cat([hue, edge.expand(-1, 3)], -1)
         colours = table[:, first : first + 6]
         colours.copy_((colours + n.look * change).clamp(0.02, 1.0))
@@ -224,7 +229,7 @@ def _draw_colours(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor
 
 
 def _hall(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> tuple[Tensor, Tensor]:
-    """Return grounds and walls, some of them plain, the others with photographs at random."""
+    """Return grounds and walls, some of them plain, the others with random photographs."""
     pictured = d.chance(n.ground)[:, None]
     brightness = d.uniform(0.45, 1.1, 1)
     tint = brightness * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
@@ -241,7 +246,7 @@ def _hall(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> tuple[Tensor,
 
 
 def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
-    """Return lights drawn at random."""
+    """Return random lights."""
     slope = d.normal(0.5, 2)
     direction = _flat(slope, torch.ones(len(slope)))
     direction = F.normalize(direction, dim=-1)
@@ -253,7 +258,7 @@ def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
 
 
 def draw_halls(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
-    """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
+    """Return the scenes with random halls, colours, lights, vignetting and sensors."""
     ground, walls = _hall(scenes, d, textures, n)
     ball, goal = _draw_colours(scenes, d, n)
     light = _lit(scenes, d, n)
@@ -271,8 +276,8 @@ def draw_halls(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
 
 
 def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
-    """Things of any colour, half of them of one like the ball's or the square's; none on the square
-    or before the ball.
+    """Return random other objects, half of them with colours that resemble those of ball or square;
+    none is on the square, and other balls are not close to the ball.
     """
     kind = d.chance(0.6 * n.clutter, THINGS) * (1.0 + d.one_of(3, THINGS))
     angle = d.uniform(0.0, 6.28, THINGS)
@@ -306,25 +311,25 @@ def _quat(rot: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Truth:
-    """Return the places of ball and square in the pictures, at the instants that their rows were
+    """The true positions of ball and square in the pictures, at the times at which their rows were
     exposed.
     """
 
     ball_c: Tensor  # centre [m], shape (E, 3), camera frame
-    # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
+    # corners of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
     corners_c: Tensor
     rot_wc: Tensor  # camera to world, shape (E, 3, 3)
-    ball_visible: Tensor  # whole in the field of view, shape (E,), bool
-    goal_visible: Tensor  # likewise
+    ball_visible: Tensor  # whether the whole ball is in the field of view, shape (E,), bool
+    goal_visible: Tensor  # whether the whole square is in the field of view, shape (E,), bool
 
     @property
     def ball_ray(self) -> Tensor:
-        """Unit rays to the ball, shape (E, 3)."""
+        """Return unit rays to the ball, shape (E, 3)."""
         return F.normalize(self.ball_c, dim=-1)
 
 
 def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
-    """See `Truth`; all scenes have this lens."""
+    """Return the true positions in scenes that all have this lens."""
     rot = torch.from_numpy(Rotation.from_quat(scenes.pose[:, 3:7].double().numpy()).as_matrix())
     goal = scenes.goal.double()
     ball = scenes.ball[:, None].double()

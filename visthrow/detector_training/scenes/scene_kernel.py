@@ -1,11 +1,10 @@
-"""The renderer's kernel: one thread a pixel, rays through the lens against ball, things, rope,
-ground square, ground and walls.
+"""The renderer's kernel, with one thread for each pixel: it intersects rays through the lens with
+ball, other objects, rope, goal square, ground and walls.
 
-Each sample of a pixel has its own place in it, spread by the defocus, and its own instant within
-the exposure of its row, so that motion, rolling shutter and defocus need no code of their own.
-Colours are linear up to the sensor, which adds shot and read noise and the gamma. The structs hold
-the rows of `scene.Scenes`; `rows.toml` describes their columns. The same seed gives the same
-picture."""
+Each sample of a pixel has its own position in the pixel, blurred by the defocus, and its own time
+within the exposure of its row. Motion blur, rolling shutter and defocus follow from this. Colours
+are linear up to the sensor, which adds shot noise, read noise and gamma. The structs hold the rows
+of `scene.Scenes`; `rows.toml` describes their columns. The same seed yields the same picture."""
 
 from typing import Any
 
@@ -14,15 +13,15 @@ import warp as wp
 from visthrow.detector_training.scenes import textures
 from visthrow.detector_training.scenes.scene import ROW_COLUMNS
 
-LENS_STEPS = wp.constant(12)  # Newton's steps to the angle of a pixel; the lens is monotonic
+LENS_STEPS = wp.constant(12)  # Newton iterations for the angle of a pixel; the lens is monotonic
 
-VEHICLE_RADIUS = wp.constant(0.09)  # of its shadow [m]
+VEHICLE_RADIUS = wp.constant(0.09)  # radius of the vehicle's shadow [m]
 MIPS = wp.constant(textures.MIPS)
 SIZE = wp.constant(textures.SIZE)
 
 
 def _struct(name: str, columns: dict[str, Any]) -> Any:
-    """Return a Warp struct of a row."""
+    """Return the Warp struct of a row."""
     fields = {"__module__": __name__, "__annotations__": columns}
     return wp.struct(type(f"{name.title()}Row", (), fields))
 
@@ -43,14 +42,14 @@ Textures = wp.array2d(dtype=wp.uint8)
 
 @wp.func
 def theta_d(theta: float, k: wp.vec4) -> float:
-    """Distance from the principal point of an angle off the axis [rad]."""
+    """Return the normalised distance from the principal point for an angle from the axis [rad]."""
     t2 = theta * theta
     return theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
 
 
 @wp.func
 def turn_axes(x: float, y: float, yaw: float) -> wp.vec2:
-    """A place on axes that are turned by an angle."""
+    """Return the coordinates of a point on axes that are rotated by an angle."""
     c = wp.cos(yaw)
     s = wp.sin(yaw)
     return wp.vec2(c * x + s * y, c * y - s * x)
@@ -58,7 +57,7 @@ def turn_axes(x: float, y: float, yaw: float) -> wp.vec2:
 
 @wp.func
 def angle_of(radius: float, k: wp.vec4, limit: float) -> float:
-    """Angle off the axis at a distance from the principal point, theta_d [rad]."""
+    """Return the angle from the axis [rad] for a normalised distance from the principal point."""
     theta = wp.min(radius, limit)
     for _ in range(LENS_STEPS):
         t2 = theta * theta
@@ -69,7 +68,9 @@ def angle_of(radius: float, k: wp.vec4, limit: float) -> float:
 
 @wp.func
 def mirror(x: float) -> float:
-    """A coordinate folded into 0 to 1: photographs do not tile, their mirror images do."""
+    """Return a coordinate folded into 0 to 1, as photographs tile without seams only if
+    mirrored.
+    """
     y = x - 2.0 * wp.floor(0.5 * x)
     return wp.where(y > 1.0, 2.0 - y, y)
 
@@ -96,8 +97,8 @@ def texture(
     footprint: float,
     chance: float,
 ) -> wp.vec3:
-    """Bilinear colour of a texture at u, v [tiles]; ``footprint`` of the sample [tiles], ``chance``
-    rounds the level.
+    """Return the bilinear colour of a texture at u, v [tiles]; ``footprint``: size of the sample
+    [tiles], ``chance``: random number that rounds the level.
     """
     if which < 0:  # plain grey
         return wp.vec3(1.0, 1.0, 1.0)
@@ -128,7 +129,7 @@ def texture(
 
 @wp.func
 def sphere(eye: wp.vec3, ray: wp.vec3, centre: wp.vec3, radius: float) -> float:
-    """Distance to a ball along a ray, or a large number."""
+    """Return the distance to a ball along a ray, or a large number."""
     offset = centre - eye
     distance = wp.dot(ray, offset)
     discriminant = radius * radius - wp.dot(offset, offset) + distance * distance
@@ -143,7 +144,7 @@ def lit(normal: wp.vec3, light: LightRow) -> float:
 
 @wp.func
 def ball_colour(normal: wp.vec3, turn: wp.quat, colour: wp.vec3, seam: wp.vec3) -> wp.vec3:
-    """A tennis ball: felt with a seam."""
+    """Return the colour of a tennis ball, felt or seam, for a normal."""
     n = wp.quat_rotate_inv(turn, normal)
     off = wp.abs(n[2] - 0.45 * wp.sin(2.0 * wp.atan2(n[1], n[0])))
     return wp.where(off < 0.09, seam, colour)
@@ -151,7 +152,9 @@ def ball_colour(normal: wp.vec3, turn: wp.quat, colour: wp.vec3, seam: wp.vec3) 
 
 @wp.func
 def square(x: float, y: float, goal: GoalRow, below: wp.vec3) -> wp.vec3:
-    """The goal square at a place from its centre, on its own axes [m], or what lies below it."""
+    """Return the goal square's colour at a point relative to its centre, on its axes [m], or
+    ``below`` outside it.
+    """
     reach = wp.max(wp.abs(x), wp.abs(y))
     side = goal.side
     mark = int(goal.mark)
@@ -171,7 +174,9 @@ def square(x: float, y: float, goal: GoalRow, below: wp.vec3) -> wp.vec3:
 
 @wp.func
 def thing_over(thing: ThingRow, point: wp.vec3, below: wp.vec3) -> wp.vec3:
-    """Colour of a disc or rectangle at a point of the ground, or what lies below it."""
+    """Return the colour of a disc or rectangle at a point of the ground, or ``below`` outside
+    it.
+    """
     kind = int(thing.kind)
     if kind != 1 and kind != 2:
         return below
@@ -187,7 +192,7 @@ def thing_over(thing: ThingRow, point: wp.vec3, below: wp.vec3) -> wp.vec3:
 
 @wp.func
 def shade(colour: wp.vec3, point: wp.vec3, body: wp.vec3, size: float, light: LightRow) -> wp.vec3:
-    """A colour of the ground in the soft shadow of a round body."""
+    """Return a colour of the ground, darkened by the soft shadow of a round body."""
     x = point[0] - body[0] + light.dir[0] / light.dir[2] * body[2]
     y = point[1] - body[1] + light.dir[1] / light.dir[2] * body[2]
     soft = size + 0.15 * body[2]
@@ -206,7 +211,7 @@ def ground_colour(
     depth: float,
     chance: float,
 ) -> wp.vec3:
-    """Colour of the ground: texture, what lies on it, the square, the shadows of ball
+    """Return the colour of the ground with texture, objects, goal square, and the shadows of ball
     and vehicle.
     """
     ground = scene.ground
@@ -228,7 +233,7 @@ def ground_colour(
 
 @wp.func
 def wall_distance(half: float, eye: float, ray: float) -> float:
-    """Distance along a ray to one of two opposite walls, from numbers of one axis."""
+    """Return the distance along a ray to one of two opposite walls, from components on one axis."""
     wall = wp.where(ray > 0.0, half, -half)
     return (wall - eye) / wp.where(wp.abs(ray) < 1.0e-6, 1.0e-6, ray)
 
@@ -237,7 +242,7 @@ def wall_distance(half: float, eye: float, ray: float) -> float:
 def wall_colour(
     scene: SceneRow, textures: Textures, eye: wp.vec3, ray: wp.vec3, chance: float
 ) -> wp.vec3:
-    """Walls and ceiling of the hall, a box with a photograph on each side."""
+    """Return the colour of walls and ceiling, a box with a photograph on each side."""
     walls = scene.walls
     tx = wall_distance(walls.half, eye[0], ray[0])
     ty = wall_distance(walls.half, eye[1], ray[1])
@@ -256,7 +261,7 @@ def wall_colour(
 
 @wp.func
 def hides(rope: RopeRow, eye: wp.vec3, ray: wp.vec3, centre: wp.vec3, depth: float) -> bool:
-    """Whether the rope to a ball stands before what a ray meets at a depth."""
+    """Return whether the rope to a ball hides the point at a depth along a ray."""
     top = rope.top + eye
     off = top - eye
     way = centre - top
@@ -280,7 +285,9 @@ def radiance(
     centre: wp.vec3,
     chance: float,
 ) -> wp.vec3:
-    """Light along a ray; nearest first: rope, ball, other balls, ground, walls."""
+    """Return the light along a ray from the nearest of rope, ball, other balls, ground and
+    walls.
+    """
     light = scene.light
     ball = scene.ball
     if ray[2] < -1.0e-4:
@@ -318,7 +325,7 @@ def render(
     # Out:
     image: wp.array4d(dtype=wp.uint8),
 ):
-    """Render a pixel; see the module."""
+    """Render a pixel."""
     e, v, u = wp.tid()
     scene = scenes[e]
     lens = scene.lens

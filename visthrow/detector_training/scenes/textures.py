@@ -1,8 +1,8 @@
-"""Photographs as textures: those that scikit-image ships, or a folder of one's own.
+"""Load photographs as textures, from scikit-image or from a folder.
 
-scikit-image's wheel holds them with their licences named in ``skimage.data``: brick, grass, gravel
-and coffee are CC0, rocket and astronaut NASA's (public domain), motorcycle of the Middlebury stereo
-data, chelsea CC0, color and cell of its contributors."""
+scikit-image's wheel contains them, and ``skimage.data`` states their licences: brick, grass,
+gravel, coffee and chelsea are CC0, rocket and astronaut are NASA's (public domain), motorcycle is
+from the Middlebury stereo data, and color and cell are from its contributors."""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 
 SIZE = 512  # side of the finest level [px]
-MIPS = 7  # levels, each half as large as the one before
+MIPS = 7  # number of levels, each half as large as the previous one
 
 TRAINING = ("brick", "gravel", "coffee", "motorcycle_left", "rocket", "color", "coins")
 HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")
-"""Photographs of scikit-image that a detector is trained on, and that it is measured on."""
+"""Photographs of scikit-image for the training of a detector, and for its evaluation."""
 
 
 def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAINING) -> list[Path]:
-    """Files of photographs.
+    """Return the files of photographs.
 
-    Raises ValueError: no photograph there, or scikit-image is not installed.
+    Raises ValueError: there are no photographs, or scikit-image is not installed.
 
     Args:
-        folder: of one's own, all its PNG and JPEG files; None: scikit-image's.
-        names: of scikit-image's.
+        folder: folder whose PNG and JPEG files are used; None for scikit-image's photographs.
+        names: names of scikit-image's photographs.
     """
     if folder is None:
         spec = find_spec("skimage")
@@ -52,10 +52,10 @@ def photographs(folder: str | Path | None = None, names: tuple[str, ...] = TRAIN
 
 
 def pyramid(files: list[Path]) -> np.ndarray:
-    """Textures with their coarser levels, RGB, uint8, shape (T, bytes of a pyramid): what the
-    renderer reads.
+    """Return textures with their coarser levels for the renderer, RGB, uint8, shape (T, bytes of a
+    pyramid).
 
-    Raises ValueError: a file that is no picture.
+    Raises ValueError: a file is not a picture.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""The report: one page with the paper's tables and figures beside ours, made of results of throws.
+"""Write the report: one page with the paper's tables and figures and ours, from results of throws.
 
-``result_set`` holds the results that are there; the other modules write a section or two each,
-which ``visthrow.view`` draws and puts together."""
+``result_set`` holds the available results. Each of the other modules writes a section or two, which
+``visthrow.view`` draws and assembles."""

@@ -1,4 +1,4 @@
-"""Section on the ablations: what each component of the simulator is worth on the
+"""Section on the ablations: the effect of each component of the simulator on the throws on the
 reference plants.
 """
 
@@ -19,8 +19,8 @@ TITLES: dict[str, str] = WORDS["ablations"]
 """Variant -> its name in tables."""
 
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
-FURTHER = tuple(name for name in TITLES if name not in PAPER_ABLATIONS)  # what the paper leaves out
-# number of throws of each ablation and of the full model (the paper's figure of landing points)
+FURTHER = tuple(name for name in TITLES if name not in PAPER_ABLATIONS)  # not in the paper
+# numbers of throws of each ablation and of the full model (the paper's figure of landing points)
 PAPER_THROWS = 5
 PAPER_FULL_THROWS = 10
 
@@ -37,14 +37,14 @@ HEADER = (
 )
 
 PLANTS = ("reference-realistic", "reference")
-"""Where ablated policies fly without retraining; the first is the stand-in for a vehicle."""
+"""Plants for ablated policies, without retraining; the first is the stand-in for a vehicle."""
 
 SHORT_LAYOUT = {"state": "state policies", "vision": "vision policies"}
 
 
 def section(thrown: ResultSet) -> Section:
-    """Ratio to the full model with its interval, where the throws land, and what that says of each
-    component.
+    """Return the section with the error ratios to the full model, the landing points, and a
+    sentence on each component.
     """
     lead = Text(
         "Each policy was trained with one component of the simulator removed and otherwise the same"
@@ -96,8 +96,8 @@ def section(thrown: ResultSet) -> Section:
 
 
 def paper_ratio(variant: str) -> st.Interval | None:
-    """Return the paper's ratio with a normal interval from its deviations and numbers of throws;
-    None for what it leaves out.
+    """Return the paper's ratio with a normal interval from its standard deviations and numbers of
+    throws; None for a variant that is not in the paper.
     """
     if variant not in PAPER_ABLATIONS:
         return None
@@ -131,7 +131,7 @@ def _row(variant: str, trainings: list[Result]) -> dict[str, str]:
 
 
 def _sentence(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
-    """One sentence: whether the component matters here as the paper says."""
+    """Return sentences on whether the component matters, here and in the paper."""
     if 1.0 in ratio:
         verdict = "no effect shows"
     elif ratio.value > 1.0:

@@ -1,6 +1,4 @@
-"""Sections on what goes beyond the paper, on the training runs, and on where the
-figures come from.
-"""
+"""Sections on extensions of the paper, on the training runs, and on the origin of the figures."""
 
 import json
 from collections import defaultdict
@@ -30,7 +28,7 @@ TITLES: dict[str, str] = WORDS["beyond"]
 
 
 def section(thrown: ResultSet) -> Section:
-    """Report moving targets, varied payloads, drag and far targets."""
+    """Return the section on moving targets, varied payloads, drag and far targets."""
     lead = Text(
         "Each is a switch of the task's config, off by default. Policies trained with it stand"
         " beside those trained without."
@@ -59,8 +57,8 @@ def section(thrown: ResultSet) -> Section:
 
 
 def _is_beyond(result: Result) -> bool:
-    """Whether a shipped policy's throws belong to the table: more than camera or noise was changed,
-    or it was far.
+    """Return whether a shipped policy's throws belong to the table: the target is far, or something
+    other than camera, noise, observation or speed was changed.
     """
     elsewhere = ("camera.", "task.noise", "task.observation", SPEED_KEY)
     return result.unit["target"] > 2.5 or any(
@@ -79,7 +77,7 @@ def _rows(results: list[Result]) -> Iterator[dict[str, str]]:
 
 
 def _changes(departures: dict) -> str:
-    """Return the changes in words, or as keys without their tables."""
+    """Return the changes as a text, in words or as keys without their tables."""
     values = {key.split(".")[-1]: value for key, value in departures.items()}
     if "payload_spread" not in values:
         words = [f"{key.split('.')[-1]} {json.dumps(value)}" for key, value in departures.items()]
@@ -94,7 +92,7 @@ def _changes(departures: dict) -> str:
 
 
 def _speeds(thrown: ResultSet, policy: str, plant: str) -> Points:
-    """Return ascending speeds of the target [m/s] and a policy's throws."""
+    """Return speeds of the target [m/s], ascending, and a policy's throws at each."""
     points = [
         (float(speed[1]), result)
         for speed, result in thrown.throws_by_value(policy, SPEED_KEY, plant, TARGET)
@@ -139,7 +137,7 @@ def _moving_goal_rows(thrown: ResultSet, missing: list[str]) -> list:
 
 
 def training_section(thrown: ResultSet) -> Section:
-    """Every training run with its time."""
+    """Return the section with all training runs and their durations."""
     runs = thrown.runs
     if not runs:
         none = Text(
@@ -203,7 +201,7 @@ def _run_row(run: dict) -> tuple[str, ...]:
 
 
 def origin_section(thrown: ResultSet) -> Section:
-    """Return a row for each command and commit that made throws, and seeds."""
+    """Return the section with the command, commit and seeds of all throws."""
     groups: dict[tuple[str, ...], list] = defaultdict(list)
     for r in thrown.results:
         command = r.provenance.get("command", "-").split(" (")[0]

@@ -1,6 +1,5 @@
-"""Pictures of the report: intervals, fronts, curves.
-
-All in the style of :mod:`visthrow.view.style`.
+"""Draw the report's pictures (intervals, fronts, curves) in the style of
+:mod:`visthrow.view.style`.
 """
 
 from collections.abc import Sequence
@@ -19,11 +18,11 @@ from visthrow.view.parts import png_of
 
 @dataclass(frozen=True)
 class Mark:
-    """A value with its interval, and the paper's beside it."""
+    """A value with its interval, and that of the paper."""
 
     label: str
     interval: Interval
-    series: int  # which colour and marker
+    series: int  # index of colour and marker
     paper: Interval | None = None
 
 
@@ -45,7 +44,7 @@ class Panel:
     title: str
     xlabel: str
     lines: tuple[Line, ...]
-    missing: str = ""  # text where there are no lines
+    missing: str = ""  # text of a panel without lines
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Trade:
     # series, label, points (N, 2): duration [s], error [m]
     fronts: tuple[tuple[int, str, ndarray], ...]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
-    crosses: tuple[tuple[str, ndarray], ...]  # the paper's
+    crosses: tuple[tuple[str, ndarray], ...]  # label, the paper's points (N, 2)
 
 
 def marks(
@@ -66,8 +65,8 @@ def marks(
     zero: float | None = None,
     log: bool = False,
 ) -> bytes:
-    """Values with intervals, one below the other; crosses stand for the paper's, a line at ``zero``
-    for what they are compared with.
+    """Draw values with intervals below each other, crosses for the paper's values, and a line at
+    ``zero``, the value of no difference; return a PNG.
     """
     names = list(dict.fromkeys(row.label for row in rows))
     count = len({row.series for row in rows})
@@ -113,8 +112,8 @@ def _log_axis(axis, name: str) -> None:
 
 
 def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
-    """Draw policies with their intervals, (label, duration, error) each; return what the legend
-    names.
+    """Draw policies with their intervals, (label, duration, error) each; return the legend's
+    entries.
     """
     labels: dict[str, object] = {}
     for i, (label, duration, error) in enumerate(stars):
@@ -128,8 +127,8 @@ def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
 
 
 def trades(panels: Sequence[Trade]) -> bytes:
-    """Agility against accuracy, a panel a plant; lines join the settings that no other
-    one beats.
+    """Draw agility against accuracy with one panel for each plant and lines through the Pareto
+    fronts; return a PNG.
     """
     figure, axes = panel_axes(len(panels), len(panels), WIDTH, 5.2, 0.0, sharex=True)
     labels: dict[str, object] = {}
@@ -159,8 +158,8 @@ def trades(panels: Sequence[Trade]) -> bytes:
 
 
 def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
-    """Curves with bands of their intervals, one scale for all panels; a ring marks the policy's own
-    value.
+    """Draw curves with bands of their intervals, with the same scale in all panels and a ring at
+    the policy's own value; return a PNG.
     """
     columns = min(3, len(panels))
     figure, axes = panel_axes(
@@ -201,8 +200,8 @@ def _curve(axis, line: Line):
 
 
 def learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
-    """Landing error over training: a panel a group, each run its environment steps (N,) and errors
-    (N,) as rows.
+    """Draw landing errors during training with one panel for each group; return a PNG. A run has
+    two rows: environment steps (N,) and errors (N,).
     """
     figure, axes = panel_axes(len(groups), min(6, len(groups)), WIDTH, 1.5, 0.3, sharex=True)
     for axis, (title, runs) in zip(axes.flat, groups):

@@ -1,5 +1,5 @@
-"""Section on the gap that vision leaves: curves of the shipped policies, and trainings with less or
-other sight.
+"""Section on the gap between vision and state: the shipped policies with imperfect vision, and
+policies that were trained with different vision.
 """
 
 from collections.abc import Iterator
@@ -30,25 +30,25 @@ TARGET = 2.0
 
 @dataclass(frozen=True)
 class GapSweep:
-    """One value of the config, changed alone."""
+    """A sweep of a single value of the config."""
 
     key: str
     title: str
     xlabel: str
-    trained_at: float  # in the units of the axis; the value that both policies are flown with
-    scale: float = 1.0  # of the axis; of a range the mean counts
+    trained_at: float  # value under which both policies are flown, in units of the axis
+    scale: float = 1.0  # factor from the config to the axis; for a range its mean is used
     policies: tuple[str, ...] = ("vision",)
 
 
 SWEEPS = tuple(GapSweep(**table) for table in WORDS["sweeps"])
-"""What was swept; values of the lists ``gap`` and ``quick``."""
+"""The sweeps; their values are those of the lists ``gap`` and ``quick``."""
 
 TRAINED: dict[str, str] = WORDS["trained"]
 """Variant of a vision training -> its name, in the order of the table."""
 
 
 def section(thrown: ResultSet) -> Section:
-    """Curves, what stands behind them, and the trainings."""
+    """Return the section with the curves, their figures, and the trainings."""
     panels = []
     rows = []
     missing = []
@@ -88,8 +88,8 @@ def section(thrown: ResultSet) -> Section:
 
 
 def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
-    """Points of a curve, the policy's own value among them: value in the axis' units and throws,
-    ascending.
+    """Return the points of a curve, including the policy's own value: value in units of the axis,
+    ascending, and throws.
     """
     points = {
         round(sweep.scale * float(np.mean(value)), 9): r
@@ -112,15 +112,15 @@ def _rows(sweep: GapSweep, points: Points) -> Iterator[dict[str, str]]:
 
 
 def _list_trained(thrown: ResultSet, missing: list[str]) -> list:
-    """Vision policies that were trained with other sight, each in its own simulator and on the
-    reference plant.
+    """Return picture and table of vision policies that were trained with different vision, in their
+    own simulator and on the reference plant.
     """
     marks = []
     rows = []
     plants = ("hybrid", "reference-realistic")
     for (variant, title), (series, plant) in product(TRAINED.items(), enumerate(plants)):
         full = thrown.seeds("vision", "full", plant, TARGET, {})
-        # a reference plant is what it is, whatever the training had
+        # the reference plant is the same for all trainings, so any departures are accepted
         nominal = {} if plant == "hybrid" or variant == "full" else ANY
         results = thrown.seeds("vision", variant, plant, TARGET, nominal)
         if not results:

@@ -1,4 +1,4 @@
-"""The available results, and queries of them."""
+"""The available results, and queries on them."""
 
 import json
 from collections.abc import Iterable
@@ -16,14 +16,14 @@ from visthrow.paper import RECORDS
 from visthrow.paper.report.charts import Line
 from visthrow.paper.results import PROTOCOL, Result, join, load_all
 
-SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the package
+SHIPPED = ("state", "vision")  # the paper's two policies, in the package
 
 Points = list[tuple[float, Result]]
-"""Values, and what was thrown with each."""
+"""Values, each with its throws."""
 
 ANY = object()  # any departures
 
-PARTS = ("throws", "training", "findings")  # folders of a folder of records
+PARTS = ("throws", "training", "findings")  # subfolders of a folder of records
 
 WORDS = tables_beside(__file__, "report.toml")
 
@@ -35,20 +35,20 @@ SHORT: dict[str, str] = WORDS["plants"]
 class ResultSet:
     """Results, training runs and findings."""
 
-    results: tuple[Result, ...]  # sets of throws, batches joined
-    runs: tuple[dict[str, Any], ...] = ()  # as the records hold them
-    # section -> text written beside the data
+    results: tuple[Result, ...]  # sets of throws, with batches joined
+    runs: tuple[dict[str, Any], ...] = ()  # training runs, in the form of the records
+    # section -> recorded text on its data
     findings: dict[str, str] = field(default_factory=dict)
 
     def policies(
         self, plant: str, target: float, departures: Any = ANY, **conditions: str
     ) -> list[Result]:
-        """Throws of learnt policies at a target [m], one result a policy: of several alike the one
-        with most throws.
+        """Return the throws of learnt policies at a target [m], one result for each policy: the one
+        with the most throws.
 
         Args:
-            plant, target: of the throws.
-            departures: with which they were flown; :data:`ANY` do not matter.
+            plant, target: plant and target of the throws.
+            departures: departures under which they were flown; :data:`ANY` for all.
             conditions: layout, variant or policy.
         """
         if departures is not ANY:
@@ -59,14 +59,14 @@ class ResultSet:
         return [best[name] for name in sorted(best)]
 
     def shipped_throws(self, name: str, plant: str, target: float) -> Result | None:
-        """Throws of a shipped policy under its own conditions."""
+        """Return the throws of a shipped policy under its own conditions."""
         return next(iter(self.policies(plant, target, {}, policy=name)), None)
 
     def seeds(
         self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY
     ) -> list[Result]:
-        """Throws of runs that were trained for the comparison, shipped policies left out; one
-        result a training seed.
+        """Return the throws of policies that were trained for the comparison, without shipped ones;
+        one result for each training seed.
         """
         return [
             result
@@ -75,7 +75,7 @@ class ResultSet:
         ]
 
     def find_results(self, **conditions: Any) -> list[Result]:
-        """Results whose unit has these entries."""
+        """Return the results whose unit has these entries."""
         return [
             r
             for r in self.results
@@ -85,7 +85,7 @@ class ResultSet:
     def throws_by_value(
         self, policy: str, key: str, plant: str, target: float
     ) -> list[tuple[Any, Result]]:
-        """Return a policy's throws with one value of the config changed, where any landed: the
+        """Return a policy's throws with a single value of the config changed, if any landed: the
         value and the throws.
         """
         return [
@@ -99,8 +99,8 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = ()) -> 
     """Read committed records, folders with ``throws``, ``training`` and ``findings``, and folders
     of single results, ``<key>.json``.
 
-    A later one counts over an earlier one; what an older protocol flew is left out. StorageError
-    for what cannot be read."""
+    Later results replace earlier ones; those of an older protocol are omitted. Raises StorageError:
+    a file cannot be read."""
     records = [Path(place) for place in records]
     collected = load_all([*(place / PARTS[0] for place in records), *folders]).values()
     runs: dict[str, dict] = {}
@@ -117,7 +117,7 @@ def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = ()) -> 
 
 
 def runs_of(path: Path) -> list[dict[str, Any]]:
-    """Training runs of a record; StorageError where it is none."""
+    """Return the training runs of a record. Raises StorageError: the file is not such a record."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))["runs"]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -127,17 +127,17 @@ def runs_of(path: Path) -> list[dict[str, Any]]:
 
 
 def errors(results: Iterable[Result]) -> list[ndarray]:
-    """Landing errors of each run [m]."""
+    """Return the landing errors of each run [m]."""
     return [result.of("error") for result in results if result.good.any()]
 
 
 def format_landed_share(*results: Result, digits: int = 1) -> str:
-    """Share of throws that landed."""
+    """Return the share of throws that landed, as text."""
     return f"{100 * np.mean(np.concatenate([result.good for result in results])):.{digits}f} %"
 
 
 def cells(*results: Result) -> dict[str, str]:
-    """Return what tables say of throws of one kind, of one training or more, by heading."""
+    """Return heading -> cell of tables, for throws of the same kind from one or more trainings."""
     unit = results[0].unit
     row = {
         "policy": unit.get("policy", "-"),
@@ -155,7 +155,7 @@ def cells(*results: Result) -> dict[str, str]:
 
 
 def line(label: str, points: Points, series: int, nominal: float | None = None) -> Line:
-    """Return the curve of mean landing errors over values; ``nominal``: the policy's value."""
+    """Return the curve of mean landing errors over values; ``nominal``: the policy's own value."""
     intervals = [st.mean(result.of("error")) for _, result in points]
     values = [value for value, _ in points]
     return Line(

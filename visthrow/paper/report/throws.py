@@ -1,4 +1,4 @@
-"""Sections on the learnt policies: their throws on each plant, and vision against state."""
+"""Sections on the learnt policies: their throws on each plant, and vision compared with state."""
 
 import math
 from itertools import product
@@ -19,8 +19,8 @@ VEHICLE = "the paper's vehicle: error [m], duration [s]"
 
 
 def throws_section(thrown: ResultSet) -> Section:
-    """Landing error and duration of the shipped policies on every plant, the paper's
-    beside them.
+    """Return the section with landing errors and durations of the shipped policies on each plant,
+    and those of the paper.
     """
     rows = []
     missing = []
@@ -52,8 +52,8 @@ def throws_section(thrown: ResultSet) -> Section:
 
 
 def is_reported(plant: str, target: float) -> bool:
-    """Whether the report wants policies thrown there: on the plain reference plant at one target
-    alone.
+    """Return whether the report includes this plant and target; the plain reference plant is
+    included at only one target.
     """
     return plant != "reference" or target == FRONT_TARGET
 
@@ -92,7 +92,9 @@ def _scatter(thrown: ResultSet) -> Picture | None:
 
 
 def vision_section(thrown: ResultSet) -> Section:
-    """Return the mean landing error of vision minus state, at each target on each plant."""
+    """Return the section with the mean landing error of vision minus that of state, at each target
+    on each plant.
+    """
     rows = []
     marks = []
     missing = []
@@ -136,8 +138,8 @@ def vision_section(thrown: ResultSet) -> Section:
 
 
 def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
-    """Difference of means: throw by throw where one policy of each met the same vehicles and
-    starts.
+    """Return the difference of means, over pairs of throws if there is one policy of each layout
+    and both flew the same vehicles and initial states.
     """
     alike = all(
         vision[0].unit[key] == state[0].unit[key] for key in ("throws", "seed", "plant", "target")
@@ -150,8 +152,8 @@ def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
 def _groups(
     thrown: ResultSet, plant: str, target: float
 ) -> tuple[list[Result], list[Result], str] | None:
-    """Return the runs of both layouts: those trained for the comparison where two or more of each
-    are there, else the shipped ones.
+    """Return the runs of both layouts: those trained for the comparison if there are at least two
+    of each, otherwise the shipped ones.
     """
     vision, state = (thrown.seeds(name, "full", plant, target, {}) for name in SHIPPED[::-1])
     if min(len(vision), len(state)) >= 2:
@@ -163,8 +165,8 @@ def _groups(
 
 
 def _paper(target: float) -> tuple[st.Interval, float] | None:
-    """Return the paper's differences: errors [m] with a normal interval from its deviations, ten
-    throws each, and durations [s].
+    """Return the paper's difference of errors [m], with a normal interval from its standard
+    deviations over ten throws each, and that of durations [s].
     """
     vision = PAPER.get(("vision", target))
     state = PAPER.get(("state", target))

@@ -1,5 +1,5 @@
-"""Sections on the model-based baseline: its throws and their breakdown, and agility against
-accuracy with the policies on it.
+"""Sections on the model-based baseline: its throws and their breakdown, and its agility and
+accuracy compared with the policies'.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,13 +31,13 @@ from visthrow.view.tables import PAPER, PAPER_FRONT, format_paper_result
 DRAWS = 800  # bootstrap samples of a hypervolume
 
 PANELS: list[dict[str, Any]] = WORDS["panels"]
-"""Panels of the front: heading, the baseline's plant, its (compensation, bounds), the plant of the
-policies on it; the first is the paper's comparison.
+"""Panels of the front: heading, the baseline's plant, its (compensation, bounds), the policies'
+plant; the first panel is the paper's comparison.
 """
 
 
 def _has_defaults(result: Result) -> bool:
-    """Whether speed and weights are those of the throws by target."""
+    """Return whether speed, weights and bounds are those of the throws by target."""
     unit = result.unit
     default = thrower.unit(unit["plant"], unit["compensation"], unit["target"], 1)
     return all(unit[name] == default[name] for name in ("speed", "w_t", "rho", "bounds"))
@@ -47,7 +47,9 @@ MODEL = "the paper's own model: error [m], duration [s]"
 
 
 def baseline_section(thrown: ResultSet) -> Section:
-    """Throws of the baseline by target, plant and compensation, broken down as in the paper."""
+    """Return the section with the baseline's throws by target, plant and compensation, broken down
+    as in the paper.
+    """
     rows = []
     missing = []
     for target in TARGETS:
@@ -77,7 +79,7 @@ def baseline_section(thrown: ResultSet) -> Section:
 
 
 def _best(thrown: ResultSet, plant: str, target: float, compensation: str) -> Result | None:
-    """Throws at the speed and with the weights of the throws by target, the most there are."""
+    """Return the largest result with default speed and weights; None without any."""
     selected = [
         r
         for r in _find_baseline(thrown, plant, target, compensation=compensation)
@@ -93,7 +95,9 @@ def _find_baseline(
 
 
 def target_table(results: Sequence[Result]) -> Grid | None:
-    """Table of throws by target and plant, the paper's beside those of the own model."""
+    """Return the table of throws by target and plant, with the paper's for the controller's
+    model.
+    """
     header = (
         "target [m] | plant | made up for | throws | landed | landing error [m] | duration [s]"
         f" | e_p [cm] | e_v [cm/s] | tracking [cm] | {MODEL}"
@@ -126,7 +130,7 @@ def _row(result: Result) -> dict[str, str]:
 
 
 def _steps() -> Iterator[Grid | Text | None]:
-    """Yield step times of the controller, from the records of ``python -m bench.mpc``."""
+    """Yield computation times of the controller's step, from records of ``python -m bench.mpc``."""
     records = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
     if not records:
         command = "`python -m bench.mpc --record mpc-cpu`"
@@ -141,7 +145,9 @@ def _steps() -> Iterator[Grid | Text | None]:
 
 
 def _bar(thrown: ResultSet) -> str:
-    """Own-model errors and durations against the paper's: within 40 % of them, or better."""
+    """Return a sentence with errors and durations in the controller's model, relative to the
+    paper's.
+    """
     words = []
     for target in TARGETS:
         best = _best(thrown, thrower.IDEAL, target, "none")
@@ -161,8 +167,8 @@ def front_section(
     rows_of_panels: Sequence[dict[str, Any]] = PANELS,
     names: Sequence[str] = SHIPPED,
 ) -> Section:
-    """Return the sweep on each plant, as in :data:`PANELS`, with the policies of these names on it,
-    and who beats whom.
+    """Return the section with the sweep on each plant, as in :data:`PANELS`, the policies of these
+    names, and sentences that compare them.
     """
     sentences: list = []
     sums: list = []
@@ -219,8 +225,8 @@ def _panel(
     kinds: Sequence[Sequence[str]],
     policies_on: str,
 ) -> charts.Trade:
-    """Return the panel of a row of :data:`PANELS`, fronts, policies and the paper's points; add its
-    sentences, its sums, what it lacks.
+    """Return the panel of a row of :data:`PANELS` with fronts, policies and the paper's points;
+    append to its ``sentences``, its table rows (``sums``) and ``missing``.
     """
     title = SHORT[plant]
     ideal = plant == thrower.IDEAL
@@ -251,12 +257,14 @@ def _panel(
 
 
 def _select_sweep(selected: Sequence[Result]) -> list[Result]:
-    """Throws of the sweep: those by target are more."""
+    """Return the throws of the sweep, without the larger sets of the throws by target."""
     return [r for r in selected if r.unit["throws"] <= FRONT_THROWS or not _has_defaults(r)]
 
 
 def points_of(selected: Sequence[Result]) -> ndarray:
-    """Mean duration [s] and landing error [m] of settings whose throws all landed, shape (N, 2)."""
+    """Return mean duration [s] and landing error [m] of the settings whose throws all landed, shape
+    (N, 2).
+    """
     return np.array([_point(r) for r in selected if r.good.all()]).reshape(-1, 2)
 
 
@@ -274,8 +282,8 @@ def _paper_points() -> tuple[tuple[str, ndarray], ...]:
 
 
 def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
-    """Hypervolume of the settings whose throws all landed, with its interval over throws; None
-    without any.
+    """Return the hypervolume of the settings whose throws all landed, with its interval over
+    throws; None without such settings.
     """
     sets = [np.column_stack([r.of("duration"), r.of("error")]) for r in selected if r.good.all()]
     if not sets:
@@ -321,8 +329,8 @@ def _verdicts(
     policies: Sequence[tuple[str, Result]],
     policies_on: str,
 ) -> Iterator[str]:
-    """Whether the paper's claim holds: no setting as accurate and as fast, and at each setting's
-    accuracy the policy faster.
+    """Yield sentences on the paper's claim: no setting is as accurate and as fast as the policy,
+    and the policy is faster than each more accurate setting.
     """
     points = points_of(selected)
     for name, result in policies:
@@ -356,7 +364,7 @@ def _count(points: Sequence) -> str:
 
 
 def _breakdown(thrown: ResultSet) -> Grid | None:
-    """Return the paper's table of settings, and ours of the own model."""
+    """Return a table of the paper's settings and ours in the controller's model."""
     selected = _select_sweep(_find_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None

@@ -1,8 +1,9 @@
-"""Lists of training runs and throws, files of ``configs/sweep``: worked in resumable pieces, on
-several GPUs or a cluster, never twice.
+"""Do lists of training runs and throws, files of ``configs/sweep``, in resumable units, on several
+GPUs or a cluster, and none twice.
 
-``units`` cuts a list into units and knows which are done, ``work`` does them, ``pool`` hands them
-out, ``record`` condenses the results into what is committed. The schema of a list is here."""
+``work_units`` divides a list into units and checks which are done, ``work`` does them, ``pool``
+distributes them, and ``sweep_record`` condenses the results into committed records. The schema of a
+list is in this module."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -17,19 +18,19 @@ Changes = tuple[str, ...]
 
 @dataclass(frozen=True)
 class ThrowParams(Bounded):
-    """Throws of every policy that names them."""
+    """A set of throws, which groups of runs refer to by name."""
 
-    plant: str  # of visthrow.throws.plants.PLANTS
-    targets: tuple[Positive, ...]  # along x [m]
-    count: int  # of each policy at each target
-    seed: int = 0  # of starts and noise
+    plant: str  # name in visthrow.throws.plants.PLANTS
+    targets: tuple[Positive, ...]  # distances along x [m]
+    count: int  # throws of each policy at each target
+    seed: int = 0  # seed of initial states and noise
     fly_in: Literal["own", "full"] = (
         "own"  # the policy's training config, or its layout's full one (state, vision_ideal)
     )
-    changes: Changes = ()  # key=value of that config
+    changes: Changes = ()  # key=value changes of this config
     allow: tuple[
         str, ...
-    ] = ()  # parts of the policy's contract that may be broken so; recorded as departures
+    ] = ()  # parts of the policy's contract that may be violated; recorded as departures
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,26 +43,26 @@ class ThrowParams(Bounded):
 
 @dataclass(frozen=True)
 class RunGroup:
-    """Training runs, or policies that are there already, with the throws that each is to fly."""
+    """Training runs or existing policies, with the throws that each flies."""
 
-    throws: tuple[str, ...]  # names of tables of throws
-    configs: tuple[str, ...] = ()  # of configs/train, or TOML files
-    seeds: tuple[int, ...] = (1,)  # every config with every one of them, seed after seed
-    changes: Changes = ()  # key=value of the configs
-    policies: tuple[str, ...] = ()  # shipped names, or files, that need no training
+    throws: tuple[str, ...]  # names of sets of throws
+    configs: tuple[str, ...] = ()  # names in configs/train, or TOML files
+    seeds: tuple[int, ...] = (1,)  # each config is trained with each seed, ordered by seed
+    changes: Changes = ()  # key=value changes of the configs
+    policies: tuple[str, ...] = ()  # shipped names or files of existing policies
 
 
 @dataclass(frozen=True)
 class SweepList:
-    """The work of a sweep, the most important first."""
+    """The work of a sweep, in the order of importance."""
 
     runs: dict[str, RunGroup]
     throws: dict[str, ThrowParams]
     commit: Literal["any", "same"] = "any"  # whether a run by another commit counts as done
-    changes: Changes = ()  # key=value of every training config
-    most_throws: int | None = None  # in any set; for a trial of the list
+    changes: Changes = ()  # key=value changes of every training config
+    most_throws: int | None = None  # largest number of throws in a set, for a trial of the list
     checkpoint_every: int = (
-        100  # iterations: what a killed training loses at most, about 14 s of one H200
+        100  # iterations; a killed training loses at most these, about 14 s of one H200
     )
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as
+"""Run tasks as jobs of a Slurm cluster, through submitit; its local executor runs the same jobs as
 processes, for a test.
 """
 
@@ -14,15 +14,15 @@ from visthrow.paper.sweep.pool import Task
 from visthrow.paper.sweep.work import EXIT_STOPPED, work
 from visthrow.paper.sweep.work_units import load_list
 
-SLACK = 5  # minutes that a job is granted beyond its piece: start of the process, last checkpoint
+SLACK = 5  # additional time of a job for the start of the process and the last checkpoint [min]
 
-# times that a task's job may vanish (preempted, out of time, its node down) before the task counts
-# as failed
+# number of times that a task's job may be lost (preempted, out of time, node down) before the task
+# counts as failed
 LOST_AT_MOST = 3
 
 
 class ClusterJob:
-    """One submitted task."""
+    """A submitted task."""
 
     def __init__(self, job: Any, task: str, lost: Counter[str]):
         self._job = job
@@ -36,14 +36,14 @@ class ClusterJob:
             return None
         try:
             return int(self._job.result())
-        except FailedJobError:  # the work raised; what it printed tells why
+        except FailedJobError:  # the work raised an error, which is in its output
             return 1
         except UncompletedJobError:
             self._lost[self._task] += 1
             return EXIT_STOPPED if self._lost[self._task] <= LOST_AT_MOST else 1
 
     def stop(self) -> None:
-        """Cancel it: Slurm's signal lets a training write its checkpoint."""
+        """Cancel the job; on Slurm's signal a training writes its checkpoint."""
         self._job.cancel()
 
     kill = stop
@@ -51,16 +51,16 @@ class ClusterJob:
 
 @dataclass
 class Cluster:
-    """Submits tasks."""
+    """A cluster to which tasks are submitted."""
 
     list_name: str
     out: Path
     executor: str  # "slurm", or "local" for processes of this machine
     gpus: int
     jobs: int
-    minutes: float  # length of a piece; what is not done then is submitted again
+    minutes: float  # duration of a job's work; unfinished work is submitted again
     changes: Changes = ()
-    # of submitit's executor, for instance ``slurm_partition``
+    # options of submitit's executor, for instance ``slurm_partition``
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -101,6 +101,6 @@ def do(
     device: str,
     minutes: float,
 ) -> int:
-    """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
+    """Do a task's units in a job; return the exit status of ``visthrow sweep work``."""
     os.chdir(folder)
     return work(load_list(list_name, changes), Path(out), ids, device, minutes)

@@ -1,10 +1,10 @@
-"""Hands units out: trainings and throws in the training simulator to devices, throws on the
+"""Distribute units: trainings and throws in the training simulator to devices, throws on the
 reference plant to CPU cores.
 
-What is handed out is a task: a training with its own policy's throws in the training simulator
-behind it, or one batch on a reference plant. Tasks run in processes of their own (:class:`Local`)
-or as jobs of a cluster (:class:`visthrow.paper.sweep.cluster.Cluster`); a process that was
-killed costs what it had not yet written, and no more."""
+A task is a training followed by its policy's throws in the training simulator, or one batch on a
+reference plant. Tasks run in separate processes (:class:`Local`) or as jobs of a cluster
+(:class:`visthrow.paper.sweep.cluster.Cluster`). A process that is killed loses only the work that
+it has not yet written."""
 
 import math
 import os
@@ -23,27 +23,27 @@ from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit
 
 VISIBLE = "CUDA_VISIBLE_DEVICES"
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-POLL = 0.3  # between two looks at what runs [s]
-GRACE = 90.0  # for a stopped process to write its checkpoint [s]
-BUSY_PAUSE = 5.0  # before a unit that another process has is looked at again [s]
+POLL = 0.3  # time between polls of running tasks [s]
+GRACE = 90.0  # time for a stopped process to write its checkpoint [s]
+BUSY_PAUSE = 5.0  # time before a task is tried again whose unit another process holds [s]
 
 
 @dataclass(frozen=True)
 class Task:
-    """Units that one process does in turn."""
+    """Units that one process does in sequence."""
 
     name: str
     ids: tuple[str, ...]
-    gpu: bool  # goes to one of the devices; else to a CPU core
+    gpu: bool  # whether it runs on one of the devices; otherwise on a CPU core
 
     def log(self, out: Path) -> Path:
-        """Return the process's output."""
+        """Return the file of the process's output."""
         return out / "logs" / f"{self.name.replace('/', '_')}.txt"
 
 
 class Process(subprocess.Popen):
-    """A task in a process of this machine; it stops by itself when this one dies (see ``visthrow
-    sweep work``).
+    """A task in a process on this machine, which stops when its parent ends (see ``visthrow sweep
+    work``).
     """
 
     def stop(self) -> None:
@@ -52,7 +52,7 @@ class Process(subprocess.Popen):
 
 @dataclass
 class Local:
-    """Starts tasks on this machine."""
+    """A starter of tasks on this machine."""
 
     list_name: str
     out: Path
@@ -63,7 +63,7 @@ class Local:
     def start(self, task: Task, device: str, minutes: float) -> Process:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         if device.startswith("cuda"):
-            # the process sees its own GPU alone, and puts no context on the others
+            # make only this GPU visible, so that the process creates no context on the others
             visible = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
             index = int(device.removeprefix("cuda:"))
             environment[VISIBLE] = visible[index] if visible else str(index)
@@ -92,16 +92,16 @@ class Local:
 
 @dataclass
 class Outcome:
-    """The work that a call did: units by name."""
+    """The outcome of a run of the pool."""
 
     failed: dict[str, str] = field(default_factory=dict)  # task -> last line of its log
-    stopped: bool = False  # before everything was done
-    interrupted: bool = False  # by Ctrl-C or SIGTERM, not by the clock
+    stopped: bool = False  # whether work remained
+    interrupted: bool = False  # whether it was stopped by Ctrl-C or SIGTERM, not by the time limit
 
 
 def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
-    """Return the remaining work that can start now, the most important first; ids that are found to
-    be done are added to ``done``.
+    """Yield the remaining tasks that can start now, in the order of importance; add the ids of
+    finished units to ``done``.
     """
 
     def is_remaining(unit: ResultSource | ThrowUnit) -> bool:
@@ -125,12 +125,13 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
 
 
 class ProcessPool:
-    """Keeps devices and cores busy until a list is done, the time is up or a stop is requested.
+    """A pool that keeps devices and cores busy until a list is done, the time is over or a stop is
+    requested.
 
-    Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
-    cores, and ``start(task, device, minutes)``, minutes infinite where no end is set. What that
-    returns has ``poll()`` for the exit status, None while it runs, ``stop()`` to write what it has
-    and end, and ``kill()``."""
+    Its ``starter`` has ``devices``, each for one task at a time; ``jobs``, the number of tasks on
+    CPU cores; and ``start(task, device, minutes)``, with infinite minutes for no limit. The
+    returned handle has ``poll()``, which returns the exit status or None while the task runs;
+    ``stop()``, to write a checkpoint and end; and ``kill()``."""
 
     def __init__(self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]):
         self.work = work
@@ -140,13 +141,13 @@ class ProcessPool:
         self.outcome = Outcome()
         self._done = set()
         self._todo = []
-        # devices and cores that are free, by whether a task goes to one of the devices
+        # free devices (True) and free cores (False), by Task.gpu
         self._free = {True: list(starter.devices), False: ["cpu"] * starter.jobs}
         self._running: dict[str, tuple[Task, str, Any]] = {}
         self._wait: dict[str, float] = {}  # task -> time before which it is not tried again
 
     def run(self, minutes: float | None = None) -> Outcome:
-        """Work; returns when nothing is left, or ``minutes`` have passed, or after Ctrl-C."""
+        """Run tasks until all are done, ``minutes`` have passed, or Ctrl-C."""
         deadline = math.inf if minutes is None else time.monotonic() + 60.0 * minutes
         self._todo = list(tasks(self.work, self.out, self._done))
         try:
@@ -167,7 +168,7 @@ class ProcessPool:
         return self.outcome
 
     def _fill(self, remaining: float) -> None:
-        """Start what there is room for."""
+        """Start tasks on free devices and cores."""
         clock = time.monotonic()
         for task in self._todo:
             if task.name in self._running or self._wait.get(task.name, 0.0) > clock:
@@ -181,7 +182,7 @@ class ProcessPool:
             self.say(f"{task.name} begins on {device}")
 
     def _reap(self) -> bool:
-        """Take note of what ended; whether anything did."""
+        """Process the tasks that have ended; return whether there were any."""
         polled = [(*started, handle.poll()) for *started, handle in self._running.values()]
         ended = [row for row in polled if row[-1] is not None]
         for task, device, status in ended:
@@ -199,7 +200,7 @@ class ProcessPool:
         return bool(ended)
 
     def _stop(self) -> None:
-        """Have everything write its checkpoint and end."""
+        """Stop all tasks, which write their checkpoints; kill those that do not end in time."""
         for handle in self._alive():
             handle.stop()
         end = time.monotonic() + GRACE
@@ -210,12 +211,12 @@ class ProcessPool:
         self._running.clear()
 
     def _alive(self) -> list[Any]:
-        """Handles of what runs."""
+        """Return the handles of running tasks."""
         return [handle for *_, handle in self._running.values() if handle.poll() is None]
 
 
 def read_last_line(log: Path) -> str:
-    """Return the last line of what a task printed."""
+    """Return the last line of a task's output."""
     if log.exists():
         return log.read_text(errors="replace").strip().rpartition("\n")[2].strip()
     return ""

@@ -1,4 +1,4 @@
-"""What is printed and kept of a list: a line a run, and two records, of the trainings and of the
+"""Report the state of a list, one line for each run, and write its two records, of trainings and of
 throws.
 """
 
@@ -25,7 +25,7 @@ CURVE_POINTS = 60  # points of a run's learning curve in the record
 
 
 def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
-    """Return a line a run, a last one with the sum, and whether all is done."""
+    """Return one line for each run and one with the totals, and whether everything is done."""
     lines = []
     seconds = 0.0
     remaining = 0
@@ -44,7 +44,7 @@ def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
 
 
 def _state(source: ResultSource, out: Path) -> tuple[str, float]:
-    """Return a training's status line, and its seconds so far."""
+    """Return a description of a training's state, and its duration so far [s]."""
     if not source.config:
         return "there already", 0.0
     rows = _progress(source, out)
@@ -60,11 +60,11 @@ def _state(source: ResultSource, out: Path) -> tuple[str, float]:
 
 
 def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
-    """Write ``training/<list>.json`` and ``throws/<list>.json``, joining what stands there already;
-    returns their paths.
+    """Write ``training/<list>.json`` and ``throws/<list>.json``, merged with existing records;
+    return their paths.
 
-    Of two results for the same question, older and newer weights or config, the one that is here
-    counts. Raises StorageError: nothing is done, and nothing stands there."""
+    For the same run or throws with other weights or another config, the result in ``out`` replaces
+    the recorded one. Raises StorageError: nothing is done, and no record exists."""
     training = records / "training" / f"{work.name}.json"
     throws = records / "throws" / f"{work.name}.json"
     runs = _runs(work, out, training)
@@ -105,7 +105,7 @@ def _progress(source: ResultSource, out: Path) -> list[dict[str, str]]:
 
 
 def _spent(rows: list[dict[str, str]]) -> list[float]:
-    """Return the seconds of work up to the end of each iteration."""
+    """Return the duration of work up to the end of each iteration [s]."""
     return list(accumulate(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows))
 
 
@@ -114,7 +114,7 @@ def _summary(source: ResultSource, out: Path) -> dict[str, Any]:
 
 
 def _final(source: ResultSource, out: Path) -> dict[str, float | None]:
-    """Mean error and duration of the throws that end a training, at 2.0 m."""
+    """Return mean error, mean duration and success of a training's final throws at 2.0 m."""
     rows = [row for row in _summary(source, out)["figures"]["throws"] if row["target"] == 2.0]
     return {
         name: rows[0].get(name) if rows else None
@@ -123,7 +123,7 @@ def _final(source: ResultSource, out: Path) -> dict[str, float | None]:
 
 
 def _run(source: ResultSource, out: Path) -> dict[str, Any]:
-    """Return a finished training for the record."""
+    """Return the record of a finished training."""
     rows = _progress(source, out)
     summary = _summary(source, out)
     experiment = source.experiment()

@@ -1,6 +1,6 @@
-"""Doing of units in this process: a piece of a training run, throws.
+"""Do units in this process: a part of a training run, or throws.
 
-What is done, or is being done elsewhere, is left alone.
+Units that are done, or that another process is doing, are skipped.
 """
 
 import fcntl
@@ -26,23 +26,24 @@ from visthrow.paper import results
 from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit, throws_folder
 from visthrow.throws.loading import Loaded, load_policy
 
-PIECES = "pieces"  # folder of a run with one file a piece
+PIECES = "pieces"  # folder of a run with one file for each part of the training
 
 EXIT_STOPPED = 130
 EXIT_BUSY = 75
 
 
 def lock_of(out: Path, name: str) -> Path:
-    """Lock file of a unit."""
+    """Return the lock file of a unit."""
     return out / "locks" / f"{name.replace('/', '_')}.lock"
 
 
 @contextmanager
 def hold_lock(path: Path) -> Iterator[None]:
-    """Hold the lock on a file, which says who has it; BusyError where another process does.
+    """Hold the lock on a file, which names the process that holds it.
 
-    The kernel releases the lock when the process ends. The file stays: if it were removed, two
-    processes could lock two files of one name."""
+    The kernel releases the lock when the process ends. The file remains: if it were removed, two
+    processes could lock two files with the same name. Raises BusyError: another process holds the
+    lock."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(os.open(path, os.O_RDWR | os.O_CREAT, 0o644), "r+", encoding="utf-8") as file:
         try:
@@ -58,7 +59,7 @@ def hold_lock(path: Path) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a living process has the lock on a file."""
+    """Return whether a process holds the lock on a file."""
     try:
         with path.open("r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -70,10 +71,10 @@ def is_locked(path: Path) -> bool:
 
 
 def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: float | None) -> int:
-    """Do trainings and throws of these ids one after the other; after so many minutes a training
-    stops with a checkpoint.
+    """Do trainings and throws of these ids in sequence; after ``minutes`` a training stops with a
+    checkpoint.
 
-    Returns 0; 130 where a training was stopped before its end; 75 where another process had the
+    Returns 0; 130 if a training was stopped before its end; 75 if another process holds the
     unit."""
     begin = time.monotonic()
     status = 0
@@ -102,8 +103,8 @@ def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: f
 def train(
     source: ResultSource, out: Path, device: str, minutes: float | None, checkpoint_every: int
 ) -> int:
-    """Train, or go on, to the end or for some minutes; returns the exit status of ``visthrow
-    train``.
+    """Start or resume a training, up to its end or for ``minutes``; return the exit status of
+    ``visthrow train``.
     """
     from visthrow.training import session
     from visthrow.training.trainer import CHECKPOINT
@@ -132,7 +133,7 @@ def train(
     status = 1
     try:
         status = session.run(args)
-        status = status if status or source.done(out) else EXIT_STOPPED  # by the clock
+        status = status if status or source.done(out) else EXIT_STOPPED  # stopped by the time limit
     finally:
         piece = {
             "start": began,
@@ -146,7 +147,7 @@ def train(
 
 
 def fly(unit: ThrowUnit, out: Path, device: str) -> None:
-    """Throw and write the result."""
+    """Fly the throws of a unit and write the result."""
     command = f"visthrow sweep run (throws {unit.set} of {unit.source.name})"
     results.finish(
         throws_folder(out),
@@ -185,10 +186,11 @@ def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
 
 
 def load(unit: ThrowUnit, out: Path) -> Loaded:
-    """Return the policy with the experiment that it is to fly in; MismatchError where the list does
-    not allow what differs.
+    """Load a unit's policy with the experiment in which it flies.
+
+    Raises MismatchError: the list does not allow a difference from the policy's contract.
     """
     layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
-    # a training's from the list: that of its file may have fields of another version
+    # a trained policy's config comes from the list: that in its file may be of another version
     name, changes = unit.flight_config(layout)
     return load_policy(unit.source.policy(out), name or None, changes, unit.params.allow)

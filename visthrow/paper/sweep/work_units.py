@@ -1,10 +1,9 @@
-"""Units of work of a list: training runs and sets of throws, where their results lie, and which are
-done.
+"""Units of work of a list, training runs and sets of throws, with the files of their results.
 
-A training run is known by a hash of its resolved config, its seed and, where the list asks for it,
-the commit: a changed config is another run, and its folder another folder. Throws are known as
-:mod:`visthrow.paper.results` knows them, by all that they depend on, the policy file's content
-included."""
+A training run is identified by a hash of its resolved config, its seed and, if the list requires
+it, the commit; a changed config yields another run with another folder. Throws are identified as in
+:mod:`visthrow.paper.results`, by everything that they depend on, including the policy file's
+content."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,7 +20,7 @@ from visthrow.task import Experiment, load_experiment
 from visthrow.throws.reference_protocol import batches
 
 FULL = {"state": "state", "vision": "vision_ideal"}
-"""Layout -> the training config whose variants are compared with it."""
+"""Layout -> the full training config, with which variants are compared."""
 
 POLICY = "policy.npz"
 SUMMARY = "summary.json"
@@ -32,55 +31,55 @@ _experiment = cache(load_experiment)
 
 @dataclass(frozen=True)
 class ResultSource:
-    """A policy: to be trained, or there already."""
+    """A policy to train, or an existing one."""
 
-    # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
+    # <config>-<seed> for a training, <config>-<group>-<seed> with changes of its group
     name: str
-    config: str = ""  # of configs/train; empty for an existing policy
+    config: str = ""  # name in configs/train; empty for an existing policy
     changes: Changes = ()
     seed: int = 0
-    key: str = ""  # of the training; empty likewise
+    key: str = ""  # hash of the training; empty for an existing policy
 
     @property
     def id(self) -> str:
-        """Name of the training on the command line and of its folder."""
+        """Return the name on the command line and of the training's folder."""
         return f"{self.name}-{self.key[:8]}" if self.key else self.name
 
     @property
     def iterations(self) -> int:
-        """That the training is to have."""
+        """Return the number of iterations of the training."""
         return self.experiment().iterations
 
     def folder(self, out: Path) -> Path:
-        """Folder of the training run."""
+        """Return the folder of the training run."""
         return out / "train" / self.id
 
     def policy(self, out: Path) -> Path:
-        """Return the policy's path, existing or not."""
+        """Return the policy's path, whether the file exists or not."""
         return self.folder(out) / POLICY if self.config else find_policy(self.name)
 
     def done(self, out: Path) -> bool:
-        """Whether the policy exists, with the training's record of it."""
+        """Return whether the policy exists and, for a training, its summary."""
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
     def experiment(self) -> Experiment:
-        """Return the configuration of its training."""
+        """Return the experiment of the training."""
         return _experiment(self.config, self.changes)
 
     @property
     def flown(self) -> Changes:
-        """Changes of the config that its policy is flown with."""
+        """Return the changes of the config under which the policy is flown."""
         return self.changes + self.experiment().flown if self.config else ()
 
 
 @dataclass(frozen=True)
 class ThrowUnit:
-    """Throws of one policy at one target: all of them in the training simulator, one batch on a
+    """Throws of one policy at one target: all of them in the training simulator, or one batch on a
     reference plant.
     """
 
     source: ResultSource
-    set: str  # name of the table of throws
+    set: str  # name of the set of throws
     params: ThrowParams
     target: float  # [m]
     count: int
@@ -88,12 +87,12 @@ class ThrowUnit:
 
     @property
     def id(self) -> str:
-        """Name on the command line."""
+        """Return the name on the command line."""
         place = "" if self.batch is None else f":{self.batch}"
         return f"{self.source.id}:{self.set}:{self.target:g}{place}"
 
     def unit(self, out: Path) -> results.Unit:
-        """Return the key of :mod:`visthrow.paper.results`; the policy must exist."""
+        """Return the unit of :mod:`visthrow.paper.results`; the policy must exist."""
         source = self.source
         params = self.params
         path = source.policy(out)
@@ -116,7 +115,7 @@ class ThrowUnit:
         return unit if self.batch is None else {**unit, "batch": self.batch}
 
     def experiments(self, out: Path) -> tuple[dict, dict]:
-        """Return the policy's own config and the one it is flown in, without the learning
+        """Return the policy's config and the config in which it is flown, without learning
         parameters.
         """
         source = self.source
@@ -132,15 +131,15 @@ class ThrowUnit:
         return nominal, state_config(*self.flight_config(nominal["task"]["observation"]["layout"]))
 
     def flight_config(self, layout: str) -> tuple[str, Changes]:
-        """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its
-        changes.
+        """Return the config of ``configs/train`` to fly in, empty for that in the policy's file,
+        and its changes.
         """
         if self.params.fly_in == "full":
             return FULL[layout], self.params.changes
         return self.source.config, self.source.flown + self.params.changes
 
     def done(self, out: Path) -> bool:
-        """Whether the result exists."""
+        """Return whether the result exists."""
         return (
             self.source.done(out)
             and (throws_folder(out) / f"{results.key_of(self.unit(out))}.json").is_file()
@@ -149,7 +148,7 @@ class ThrowUnit:
 
 @dataclass(frozen=True)
 class SweepWork:
-    """All units of a list, the most important first."""
+    """All units of a list, in the order of importance."""
 
     name: str
     sources: tuple[ResultSource, ...]
@@ -157,7 +156,7 @@ class SweepWork:
     checkpoint_every: int  # iterations
 
     def source(self, name: str) -> ResultSource:
-        """Return the training of that id; ConfigError where the list has changed."""
+        """Return the training with this id. Raises ConfigError: the list does not contain it."""
         sources = {source.id: source for source in self.sources}
         if name not in sources:
             raise ConfigError(f"no run '{name}' in the list; {suggest(name, sources)}")
@@ -170,9 +169,8 @@ def throws_folder(out: Path) -> Path:
 
 
 def variant_of(run: str) -> str:
-    """Return the difference of a training config from its layout's full one:
-
-    ``state_no_delay`` -> ``no_delay``.
+    """Return the name of a training config's difference from its layout's full config, such as
+    ``no_delay`` for ``state_no_delay``.
     """
     stem = Path(run).stem
     layout, _, variant = stem.partition("_")
@@ -180,15 +178,16 @@ def variant_of(run: str) -> str:
 
 
 def load_list(name: str, overrides: Changes = ()) -> SweepWork:
-    """Load a list by a name of ``configs/sweep`` or a file, and cut it into units; ConfigError
-    where something is wrong in it.
+    """Load a list, a name in ``configs/sweep`` or a file, and divide it into units.
+
+    Raises ConfigError: the list is invalid.
     """
     path = config.find("sweep", name)
     return expand(path.stem, config.load(SweepList, path, overrides))
 
 
 def expand(name: str, params: SweepList) -> SweepWork:
-    """Cut a list into units; ConfigError for a config, change or policy that does not exist."""
+    """Divide a list into units. Raises ConfigError: a config, change or policy does not exist."""
     sources: dict[str, ResultSource] = {}
     throws: dict[str, list[ThrowUnit]] = {}
     commit = provenance.commit() if params.commit == "same" else ""
@@ -217,7 +216,7 @@ def expand(name: str, params: SweepList) -> SweepWork:
 
 
 def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
-    """Dotted key -> value flown with, wherever two configs differ."""
+    """Return dotted key -> value in ``flown``, for all differences of two configs."""
     changed: dict[str, Any] = {}
     for key in sorted(base.keys() | flown.keys()):
         before = base.get(key)
@@ -230,7 +229,7 @@ def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
 
 
 def _make_training(name: str, mark: str, changes: Changes, seed: int, commit: str) -> ResultSource:
-    # without defaults, so that a field that is added later changes no key
+    # without defaults, so that a new field with a default does not change keys
     stated = config.to_dict(_experiment(name, changes), defaults=False)
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
     return ResultSource(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
@@ -263,4 +262,4 @@ _ANYTHING = (
     *("observation", "action", "control_period", "release"),
     *("vehicle", "rope", "air", "laws", "camera"),
 )
-"""Every section of a contract: here the config is only read; a flight states what may differ."""
+"""All sections of a contract, which may differ here because the config is only read."""
