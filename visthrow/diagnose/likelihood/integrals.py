@@ -79,13 +79,13 @@ def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray
     coupling of scales and fitted columns is divided among the channels by their degrees of
     freedom."""
 
-    parts = parallel_map(_evaluate, grams, _shapes(grams, noise))
+    parts = map(_evaluate, grams, _shapes(grams, noise))
     return tuple(map(np.array, zip(*parts)))
 
 
 def _shapes(grams: Sequence[Gram], noise: Noise) -> list[_Shape]:
     """Factorise the normal equations of windows."""
-    return parallel_map(partial(_shape, noise=noise), grams, noise.share)
+    return list(map(partial(_shape, noise=noise), grams, noise.share))
 
 
 def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:
@@ -96,11 +96,12 @@ def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:
     of_latents = (levels * share)[gram.latent_block]
     level = np.append(np.ones(gram.nuisances), of_latents)
     weight = noise.scale**-2.0
-    normal = np.einsum("c,cij->ij", weight, _inner(gram)) * np.outer(level, level)
+    normal = np.einsum("c,cij->ij", weight, _inner(gram)) * level * level[:, None]
     factor = _factor(normal + np.eye(len(level)), gram)
     log_diagonal = np.log(np.diag(factor)).sum()
     log_det = 2.0 * (log_diagonal + gram.log_sigma + gram.count @ np.log(noise.scale))
-    return _Shape(weight, level, lapack.dtrtri(factor, lower=1)[0], log_det)
+    root = lapack.dtrtri(factor.T, overwrite_c=1)[0].T  # LAPACK's arrays are ordered by columns
+    return _Shape(weight, level, root, log_det)
 
 
 def _inner(gram: Gram) -> ndarray:
@@ -113,11 +114,11 @@ def _factor(normal: ndarray, gram: Gram) -> ndarray:
 
     The search for noise levels may try extreme ones, beside which the identity is lost in rounding.
     Then the diagonal is increased a little."""
-    for growth in (0.0, ROUNDING):
+    for _ in range(2):
         try:
-            return np.linalg.cholesky(normal + growth * np.diag(np.diag(normal)))
+            return np.linalg.cholesky(normal)
         except np.linalg.LinAlgError:
-            continue
+            normal = normal + ROUNDING * np.diag(np.diag(normal))
     where = f"window of flight {gram.flight}, phase {gram.phase}"
     raise DiagnoseError(f"{where}: the normal equations are singular")
 
@@ -159,15 +160,12 @@ class Integrals:
 
         Raises DiagnoseError: as :func:`fitted`, or the information is negative beyond rounding."""
         self._shapes = _shapes(grams, noise)
-        # L^-1 P^1/2 U' W S of each window, shape (n, K)
-        self._halves = parallel_map(_half, grams, self._shapes)
-        count = max(half.shape[1] for half in self._halves)
+        self._halves, of_windows = zip(*parallel_map(_reduce, grams, self._shapes))
+        count = max(map(len, of_windows))
         # windows with fewer effects have zeros for the last ones
         information = np.zeros((len(grams), count, count))
-        for row, gram, shape, half in zip(information, grams, self._shapes, self._halves):
-            effects = gram.inner[:, gram.hidden :, gram.hidden :]
-            reduced = np.einsum("c,cij->ij", shape.weight, effects) - half.T @ half
-            row[: len(reduced), : len(reduced)] = 0.5 * (reduced + reduced.T)
+        for row, reduced in zip(information, of_windows):
+            row[: len(reduced), : len(reduced)] = reduced
         self._information = without_rounding(information, grams)
         self._flights = np.array([gram.flight for gram in grams])
         self._samples = np.array([gram.count.sum() for gram in grams])
@@ -194,9 +192,11 @@ class Integrals:
         return Statistics(self._flights, self._information, score, square, self._samples, sizes)
 
 
-def _half(gram: Gram, shape: _Shape) -> ndarray:
-    """Return the whitened inner products of a window's integrated columns and its effects, shape
-    (n, K).
+def _reduce(gram: Gram, shape: _Shape) -> tuple[ndarray, ndarray]:
+    """Return the whitened inner products of a window's integrated columns and its effects,
+    L^-1 P^1/2 U' W S, shape (n, K), and the information about the effects, shape (K, K).
     """
-    right = gram.inner[:, : gram.hidden, gram.hidden :]
-    return shape.root @ (shape.level[:, None] * np.einsum("c,cij->ij", shape.weight, right))
+    effects = np.einsum("c,cij->ij", shape.weight, gram.inner[:, :, gram.hidden :])
+    half = shape.root @ (shape.level[:, None] * effects[: gram.hidden])
+    information = effects[gram.hidden :] - half.T @ half
+    return half, 0.5 * (information + information.T)

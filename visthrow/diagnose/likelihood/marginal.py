@@ -295,11 +295,13 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     if not gram.latents:
         return gram
     of_axis = knot_factor(window, time)
-    factor = np.kron(np.eye(gram.latents // len(of_axis)), of_axis)
+    axes = gram.latents // len(of_axis)
+    factor = np.kron(np.eye(axes), of_axis)
     part = slice(gram.nuisances, gram.hidden)
     inner = gram.inner.copy()
-    inner[:, part] = factor.T @ inner[:, part]
-    inner[:, :, part] = inner[:, :, part] @ factor
+    for half in (inner[:, part], np.swapaxes(inner, 1, 2)[:, part]):
+        blocks = half.reshape(len(inner), axes, len(of_axis), -1)  # a view
+        blocks[:] = of_axis.T @ blocks
     cross = gram.cross.copy()
     cross[:, part] = cross[:, part] @ factor
     return replace(gram, inner=inner, cross=cross, factor=factor)

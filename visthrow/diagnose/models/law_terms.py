@@ -94,7 +94,8 @@ class Term:
     def read(self, values: KnotValues) -> ndarray:
         """Return the force or torque at the knots with a coefficient of 1, shape (k, 3)."""
         vector = VECTORS[self.block][self.vector].read(values)
-        return _product(self.factors, values)[:, None] * vector
+        scalars = [SCALARS[name].read(values)[:, None] for name in self.factors]
+        return math.prod(scalars, start=vector)
 
     def law(self, coefficient: float) -> LawParams:
         """Return the law with a coefficient."""
@@ -159,12 +160,6 @@ def carries(latent_block: ndarray, block: str) -> bool:
     """Return whether a window has all latents on which terms of a block act."""
     latent_blocks = LATENT_BLOCKS if block == JOINT else (block,)
     return all(LATENT_BLOCKS.index(name) in latent_block for name in latent_blocks)
-
-
-def _product(factors: Sequence[str], values: KnotValues) -> ndarray:
-    """Return the product of scalars at the knots, shape (k,)."""
-    scalars = (SCALARS[name].read(values) for name in factors)
-    return math.prod(scalars, start=np.ones(len(values["time"])))
 
 
 def _dot(a: ndarray, b: ndarray) -> ndarray:
@@ -260,10 +255,11 @@ def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
     """
     vectors = VECTORS[terms[0].block]
     names = dict.fromkeys(term.vector for term in terms)
-    factors = dict.fromkeys(term.factors for term in terms)
     directions = np.stack([vectors[name].read(values) for name in names], axis=-1)
-    products = np.stack([_product(scalars, values) for scalars in factors], axis=-1)
-    every = products[:, None, :, None] * directions[:, :, None]
+    products = {(): np.ones(len(directions))}
+    for factors in filter(None, dict.fromkeys(term.factors for term in terms)):
+        products[factors] = products[factors[:-1]] * SCALARS[factors[-1]].read(values)
+    every = np.stack([*products.values()], axis=-1)[:, None, :, None] * directions[:, :, None]
     return every.reshape(len(directions), 3, len(terms))
 
 

@@ -10,7 +10,6 @@ from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names, Scatter
@@ -118,7 +117,7 @@ def explain(
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
-    simulated = parallel_map(finite, windows)
+    simulated = [finite(window) for window in windows]
     considered = [i for i, w in enumerate(windows) if w.flight not in without]
     usable = tuple(i for i in considered if simulated[i])
     if 2 * len(usable) < len(considered) or not usable:

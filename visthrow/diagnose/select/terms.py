@@ -24,7 +24,6 @@ from visthrow.diagnose.likelihood.marginal import (
     in_one_channel,
     with_latent_effects,
 )
-from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import (
     JOINT,
     SCALARS,
@@ -107,8 +106,7 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
-    weighed = parallel_map(partial(in_one_channel, scale=noise.scale), grams)
-    extended = parallel_map(with_latent_effects, weighed)
+    extended = [with_latent_effects(in_one_channel(gram, noise.scale)) for gram in grams]
     unscaled = replace(noise, scale=np.ones(1))
     parts = Integrals(extended, unscaled).statistics(extended, point.theta)
     plain = parts.first(len(point.theta)).by(parts.flights)
@@ -143,7 +141,7 @@ class Survey:
         if curves:
             terms = tuple(term for term in terms if len(term.factors) == 1)
             values_of = partial(_hats, terms, _places(terms, [self.knots[w] for w in carriers]))
-        parts = parallel_map(lambda w: self._in_window(w, block, values_of), carriers)
+        parts = [self._in_window(w, block, values_of) for w in carriers]
         square, knots, information, score, cross = map(sum, zip(*parts))
         return Screen(terms, np.sqrt(square / max(knots, 1)), information, score, cross)
 
@@ -283,7 +281,7 @@ def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point
     none = np.zeros(len(terms))
     widened = []
     for point in points:
-        windows = parallel_map(lambda w: with_terms(w, terms, none), point.windows)
+        windows = [with_terms(window, terms, none) for window in point.windows]
         grams = grams_of(windows, wide.priors.floor, channels)
         grams = correlated_of(grams, windows, point.noise.correlation_time)
         theta = np.append(point.theta, none)
