@@ -121,7 +121,7 @@ class Direct:
         return {**self.plant.landing, "start": start, "latch": latch}
 
     def _fly(self, now: float, level: np.ndarray, latch: float | None) -> None:
-        command = self._set_points.flown(now, self.plant.period)
+        command = self._set_points.compute_command(now, self.plant.period)
         after = math.inf if latch is None else max(latch + self._late - now, 0.0)
         trips = after < self.plant.period - SLACK
         self.plant.step(level if command is None else command, trips, after if trips else 0.0)

@@ -160,7 +160,11 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
     else what was refused.
     """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
-    lines = [f"{' and '.join(silent)} not heard; expected: {roster.expected()}"] if silent else []
+    lines = (
+        [f"{' and '.join(silent)} not heard; expected: {roster.describe_parties()}"]
+        if silent
+        else []
+    )
     for entry, count in roster.received.most_common():
         if silent or entry.why:
             lines.append(f"  {count / seconds:.1f} a second: {entry.text()}")

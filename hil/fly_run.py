@@ -12,7 +12,7 @@ from hil.control.calibrating import CalibrationSolver
 from hil.control.loop import LandAfterCalibration, Loop, Operator
 from hil.control.realtime import keep, prepare
 from hil.control.recording.latency import Stages
-from hil.control.recording.record import RunRecorder, begun, pack
+from hil.control.recording.record import RunRecorder, begin_folder, pack
 from hil.control.recording.run_report import finish, summary_text
 from hil.control.recording.view import start_viewer
 from hil.control.tick.runner import Runner
@@ -74,7 +74,7 @@ def fly(args: argparse.Namespace) -> int:
     params = run_params(args)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     console = Console()
-    with begun(folder):
+    with begin_folder(folder):
         loop, link = _prepare(args, params, folder, console)
     delay = time.monotonic() - start
     print(f"ready after {delay:.2f} s; waiting for poses", file=sys.stderr, flush=True)

@@ -32,7 +32,7 @@ from hil.params import HilParams
 from hil.poses.sources.open_source import open_source
 from hil.poses.sources.pose_source import Source
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl, MotorPlant
-from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, list_settings
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_command import MOTORS
 from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
@@ -83,7 +83,7 @@ def set_up(program: str | Path, folder: Path, params: HilParams) -> Path:
     """
     settings = folder / SETTINGS
     if not (settings / "eeprom.bin").exists():
-        Firmware(program, settings).set_up(needed(params.betaflight))
+        Firmware(program, settings).set_up(list_settings(params.betaflight))
     return settings / "eeprom.bin"
 
 

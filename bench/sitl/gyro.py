@@ -22,7 +22,7 @@ from bench.sitl.direct import SETTINGS, throw
 from bench.sitl.landings import BASE, DELAY
 from hil.params import HilParams
 from hil.rehearsal.bridges.betaflight_bridge import SAMPLE
-from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, list_settings
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.sitl.test_betaflight import program
 from visthrow import config
@@ -55,7 +55,7 @@ def fly_throw(folder: Path, step: float, seed: int) -> Path:
     if not where.exists():
         if not (settings / "eeprom.bin").exists():
             Firmware(program(), settings).set_up(
-                needed(params.betaflight) | {"blackbox_sample_rate": "1/1"}
+                list_settings(params.betaflight) | {"blackbox_sample_rate": "1/1"}
             )
         plant = type("Stepped", (HybridMotorPlant,), {"period": step})(
             load_policy(BASE).experiment, seed

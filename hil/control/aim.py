@@ -87,6 +87,6 @@ class ReleaseCheck:
             f" {self._params.bound:g} m expected"
         )
 
-    def given_up(self, time: float) -> bool:
+    def has_given_up(self, time: float) -> bool:
         """Return whether the patience is over at a time [s] since the first refused release."""
         return self._first is not None and time - self._first >= self._params.patience

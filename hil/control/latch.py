@@ -226,7 +226,7 @@ class Latch:
         self._flight = PayloadFlight(goal_w, self._start, time, self._height, self.lag)
         return self.command_time
 
-    def separated(self, time: float) -> bool:
+    def has_separated(self, time: float) -> bool:
         """Return whether the payload has separated by a time [s], by latch and lag."""
         return self.at is not None and time - self.at >= self.lag - ROUNDING
 

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any, Protocol
 
 from hil.control.calibrating import Calibrating, CalibrationSolver
-from hil.control.realtime import collected
+from hil.control.realtime import pause_garbage_collection
 from hil.control.recording.latency import Stages
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput, State, TickRecord
@@ -104,7 +104,7 @@ class Loop:
         runner = self.runner
         clock = self.clock
         begin = self.clock.now()
-        with collected():
+        with pause_garbage_collection():
             while runner.machine.state is not State.DONE and not self.source.ended:
                 finished = clock.now() - begin >= limit
                 if finished and (runner.backend.name == DryRun.name or not runner.in_flight):
@@ -203,7 +203,7 @@ class Loop:
         """Decide one tick by what the team agreed on; tell it what this vehicle is ready for."""
         if self.team is None:
             return self.runner.tick(time, *inputs)
-        self.runner.agreed = self.team.agreed(time)
+        self.runner.agreed = self.team.agree(time)
         decision = self.runner.tick(time, *inputs)
         self.team.say(decision.ready)
         return decision

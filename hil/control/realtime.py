@@ -32,7 +32,7 @@ class RealtimeParams(Bounded):
 
 
 @contextmanager
-def collected() -> Iterator[None]:
+def pause_garbage_collection() -> Iterator[None]:
     """Leave all that exists by now out of garbage collection, which is then ours to call."""
     was = gc.isenabled()
     gc.freeze()

@@ -71,14 +71,14 @@ def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
     return message("port_localization", "channel_pose", data)
 
 
-def named(name: str) -> bytes:
+def encode_name(name: str) -> bytes:
     """Return a parameter's name ``group.name`` as packets have it."""
     return name.replace(".", "\0").encode() + b"\0"
 
 
 def set_parameter(name: str, value: int) -> bytes:
     """Return a parameter of eight bits, by its name."""
-    data = bytes([FACTS["set_by_name"]]) + named(name) + bytes([FACTS["type_uint8"], value])
+    data = bytes([FACTS["set_by_name"]]) + encode_name(name) + bytes([FACTS["type_uint8"], value])
     return message("port_param", "channel_by_name", data)
 
 

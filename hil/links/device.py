@@ -118,7 +118,7 @@ def chunks(
         yield data
 
 
-def refused(port: str, number: int, error: OSError, option: str = "") -> LinkError:
+def make_port_error(port: str, number: int, error: OSError, option: str = "") -> LinkError:
     """Return the error that says why a port of this machine cannot be listened on and, where
     another program has it, what to do.
 
@@ -150,7 +150,7 @@ class UdpPort(Port):
     def __init__(self, device: Device, option: str = ""):
         """Open it; raises `LinkError` where the address is taken or not this machine's.
 
-        ``option``: as of `refused`.
+        ``option``: as of `make_port_error`.
         """
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._open = socket.socket(family, socket.SOCK_DGRAM)
@@ -161,7 +161,7 @@ class UdpPort(Port):
                 self._open.bind((device.host, device.port))
         except OSError as error:
             self._open.close()
-            raise refused(
+            raise make_port_error(
                 f"{device.kind}:{device.host}:{device.port}", device.port, error, option
             ) from error
 

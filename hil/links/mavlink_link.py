@@ -178,12 +178,12 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     if message.frame_id not in LOCAL_FRAMES:
         return None
     quat = tuple(message.q)
-    vel = _known_or_none((message.vx, message.vy, message.vz))
+    vel = _vector_or_none((message.vx, message.vy, message.vz))
     if vel is not None and message.child_frame_id in BODY_FRAMES:
         vel = rotate_one((*quat[1:], quat[0]), vel) if has_attitude(quat) else None
     elif message.child_frame_id not in LOCAL_FRAMES:
         vel = None
-    rate = _known_or_none((message.rollspeed, message.pitchspeed, message.yawspeed))
+    rate = _vector_or_none((message.rollspeed, message.pitchspeed, message.yawspeed))
     return Pose(
         message.time_usec / 1e6,
         arrival,
@@ -197,7 +197,7 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     )
 
 
-def _known_or_none(vector: Vector) -> Vector | None:
+def _vector_or_none(vector: Vector) -> Vector | None:
     """Return a vector; None for NaN, which MAVLink writes for a quantity that is not known."""
     return None if any(math.isnan(x) for x in vector) else vector
 
@@ -274,7 +274,7 @@ class LinkSync:
             peer = self.peers.setdefault((message.get_srcSystem(), self._link.sender), TimeSync())
             peer.take(message.tc1, message.ts1, arrival)
 
-    def dated(self, pose: Pose, system: int) -> Pose:
+    def date_pose(self, pose: Pose, system: int) -> Pose:
         """Return a pose of the message just handed on, dated on our clock where its sender's is
         known and the stamp is of it.
         """

@@ -236,7 +236,7 @@ class Roster:
     ) -> str | None:
         """Return why a message is not taken, or None."""
         if party is None:
-            return f"nobody of this run, which expects {self.expected()}"
+            return f"nobody of this run, which expects {self.describe_parties()}"
         if (
             party.autopilot is not None
             and kind == "HEARTBEAT"
@@ -248,12 +248,12 @@ class Roster:
             )
         if self.at.get(party.name, ...) == address:
             return None
-        if (why := self._taken(party.name, address, host_time)) is not None:
+        if (why := self._find_conflict(party.name, address, host_time)) is not None:
             return why
         first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
-    def _taken(self, name: str, address: Address, host_time: float) -> str | None:
+    def _find_conflict(self, name: str, address: Address, host_time: float) -> str | None:
         """Return why an address may not speak for a name that another one speaks for, or None."""
         bound = self.at.get(name, address)
         if bound == address:
@@ -268,7 +268,7 @@ class Roster:
         """Return whether an address may speak for a name at a time [s]; the first one that asks is
         bound to it, under the rules of parties.
         """
-        why = self._taken(name, address, host_time)
+        why = self._find_conflict(name, address, host_time)
         if why is not None:
             self.refuse(Traffic(address, None, None, name, why))
             return False
@@ -280,7 +280,7 @@ class Roster:
         """Count what a source could not take from a sender, and say it once."""
         self.refuse(Traffic(address, None, None, kind, why), count)
 
-    def expected(self) -> str:
+    def describe_parties(self) -> str:
         """Return the parties in words."""
         texts = []
         for p in self.parties:

@@ -104,7 +104,7 @@ class TeamLink:
         members = {(device.host, device.port): k for k, device in enumerate(devices)}
         self._others = {address: k for address, k in members.items() if k != params.member}
 
-    def agreed(self, time: float) -> int:
+    def agree(self, time: float) -> int:
         """Read what has come; return what all agreed on for the tick at a time [s]."""
         self._agreement.begin(int((time + self.offset) / self._period + ROUNDING))
         for datagram in chunks(self._port, lambda sender: sender not in self._others):

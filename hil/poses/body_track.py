@@ -76,18 +76,18 @@ class Track:
         ``tether``: the cable's other end, if the payload is attached. A body whose rate is not
         needed may lack an attitude.
         """
-        reason = self._taken(raw, tether)
+        reason = self._accept(raw, tether)
         self.stream.note(raw, reason)
         return reason
 
-    def _taken(self, raw: Pose, tether: Tether | None) -> str | None:
-        if raw.lost():
+    def _accept(self, raw: Pose, tether: Tether | None) -> str | None:
+        if raw.is_lost():
             raw = replace(raw, valid=False)
         if not self._turns and raw.quat is not None and not has_attitude(raw.quat):
             raw = replace(raw, quat=None)
         pose = self.frames.pose_from_source(raw)
         before = self.gate.last
-        stepped = self.gate.stepped(pose)
+        stepped = self.gate.clock_stepped(pose)
         reason = self.gate.check(pose, self._vel if self._pose is not None else None, tether)
         if reason is not None:
             return reason
@@ -106,7 +106,7 @@ class Track:
         if self._turns:
             _ = self.filter.rate
 
-    def expected(self, time: float) -> Vector | None:
+    def predict_position(self, time: float) -> Vector | None:
         """Predict the position at a time of arrival [s] from the last pose and velocity; None
         before the first pose.
         """

@@ -119,7 +119,7 @@ class Gate:
         self._changed = pose.arrival
         return None
 
-    def stepped(self, pose: Pose) -> bool:
+    def clock_stepped(self, pose: Pose) -> bool:
         """Return whether the source's clock was set between the last accepted pose and this one."""
         last = self.last
         return (
@@ -136,7 +136,7 @@ class Gate:
         if self.jumped or pose.reset != last.reset:
             self.jumped = True
             return "reset"
-        stepped = self.stepped(pose)
+        stepped = self.clock_stepped(pose)
         same = pose.pos == last.pos and pose.quat == last.quat
         if pose.stamp <= last.stamp and not stepped:
             return "repeated" if same and pose.stamp == last.stamp else "old"

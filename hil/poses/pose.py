@@ -44,7 +44,7 @@ class Pose:
     measured: float | None = None  # on the runner's clock [s], where the source's clock is known
     valid: bool = True  # False where the source itself says that it does not see the body
 
-    def lost(self) -> bool:
+    def is_lost(self) -> bool:
         """Return whether a raw pose is that of a body which its source does not see: called so, or
         written as zeros, which no measurement is.
         """

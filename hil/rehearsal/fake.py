@@ -117,7 +117,7 @@ class SetPoints:
         self._acting = None
         self._coming.clear()
 
-    def flown(self, begin: float, period: float) -> ndarray | None:
+    def compute_command(self, begin: float, period: float) -> ndarray | None:
         """Return what acts in the period from a time on [s]: the mean, where it changes within it;
         None before the first one.
         """
@@ -184,7 +184,7 @@ class Witness:
                 " fence",
             )
 
-    def answered(self) -> None:
+    def note_answer(self) -> None:
         """Note that the release was acknowledged: none may follow."""
         self._answered = True
 
@@ -265,7 +265,7 @@ class Fake(ABC):
         """Open a port for commands; None: they come on the link of the poses."""
         return None
 
-    def happened(self, text: str) -> None:
+    def note_event(self, text: str) -> None:
         """Note something that the autopilot did by itself, or was commanded; what goes on from one
         period to the next is one event.
         """
@@ -336,7 +336,7 @@ class Fake(ABC):
         """
         opens = is_open and self._open is False
         if is_open and self._open is None:
-            self.happened("the mechanism's output is open: nothing is released before it closes")
+            self.note_event("the mechanism's output is open: nothing is released before it closes")
             return False
         self._open = bool(is_open)
         if opens:
@@ -360,7 +360,7 @@ class Fake(ABC):
         pos = self.plant.state["pos_w"]
         if pos[2] < TOUCH:
             self.armed = False
-            self.happened("landed, disarmed")
+            self.note_event("landed, disarmed")
         return self.hold(np.array([self._place[0], self._place[1], max(pos[2] - DESCENT, LOWEST)]))
 
     @abstractmethod
@@ -368,7 +368,7 @@ class Fake(ABC):
         """Let the pilot take the vehicle over, and hold it."""
 
     @abstractmethod
-    def flown(self) -> ndarray:
+    def compute_command(self) -> ndarray:
         """Return the command of this period, by whoever flies."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
@@ -396,8 +396,8 @@ class Fake(ABC):
         if not self.taken and plant.time >= self.options.taken_after:
             self.taken = True
             self.take()
-        self._target = self._set_points.flown(plant.time, plant.period)
-        command = self.flown()
+        self._target = self._set_points.compute_command(plant.time, plant.period)
+        command = self.compute_command()
         self.last_thrust = command[0]
         after = 0.0 if self._trip is None else self._trip - plant.time
         opens = self._trip is not None and after < plant.period - SLACK

@@ -70,17 +70,17 @@ class FakeArduPilot(FakeMavlink):
         result = mav.MAV_RESULT_ACCEPTED if able else mav.MAV_RESULT_FAILED
         self.acknowledge(message.command, ANSWERS.get(self.options.answer, result))
 
-    def flown(self) -> ndarray:
+    def compute_command(self) -> ndarray:
         if self.mode == LAND_MODE:
             return self.descend()
         if self.mode not in (GUIDED, GUIDED_NOGPS) or self._target is None:
             return self.hold(self._place)
         if self.plant.time - self._last_command > self.parameters["GUID_TIMEOUT"]:
-            self.happened("levelled: no set-points")
+            self.note_event("levelled: no set-points")
             return np.array([self.weight(), 0.0, 0.0, 0.0])
-        return self._meant(self._target)
+        return self._interpret(self._target)
 
-    def _meant(self, target: ndarray) -> ndarray:
+    def _interpret(self, target: ndarray) -> ndarray:
         """Return the set-point as the parameters make it mean."""
         out = target.copy()
         state = self.plant.state

@@ -18,7 +18,7 @@ from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl
 from hil.rehearsal.bridges.betaflight_bridge import SLOW, BetaflightSitl
-from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, list_settings
 from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
@@ -108,7 +108,7 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
             )
         firmware = Firmware(args.firmware, args.folder)
         ends.callback(firmware.stop)
-        settings = firmware.set_up(needed(params.betaflight))
+        settings = firmware.set_up(list_settings(params.betaflight))
         firmware.start()
         print(
             "".join(f"{name:28} {value}\n" for name, value in settings.items()),

@@ -100,7 +100,7 @@ class FakeMavlink(Fake):
         if mode not in self.modes:
             return mav.MAV_RESULT_DENIED
         if mode != self.mode:
-            self.happened(f"mode {self.mode_text(mode)}")
+            self.note_event(f"mode {self.mode_text(mode)}")
             self.mode = mode
             self.stay()
             self.forget()
@@ -129,7 +129,7 @@ class FakeMavlink(Fake):
         elif self.is_release(message):
             self.note_release()
             if self.options.answer != "silent":
-                self.witness.answered()
+                self.witness.note_answer()
                 self.answer_release(message)
 
     def custom_mode(self, message: Any) -> int:
@@ -161,7 +161,7 @@ class FakeMavlink(Fake):
             self.acknowledge(message.command, mav.MAV_RESULT_FAILED)
         else:
             self.armed = wanted
-            self.happened("armed" if wanted else "disarmed")
+            self.note_event("armed" if wanted else "disarmed")
             self.beat_soon()
             self.acknowledge(message.command, mav.MAV_RESULT_ACCEPTED)
 

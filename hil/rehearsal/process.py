@@ -10,7 +10,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from hil.control.realtime import collected
+from hil.control.realtime import pause_garbage_collection
 from hil.errors import RunError
 from hil.links.clock import Clock
 from hil.rehearsal.fake import Fake, WirePlant
@@ -67,7 +67,7 @@ def serve(fake: Fake, clock: Clock, limit: float, out: Path | None, after: float
     fake.question_lag = 0.0
     interrupt = StopRequest((signal.SIGINT,))
     # a collection of all takes a tenth of a second
-    with contextlib.suppress(KeyboardInterrupt), interrupt as stop, collected():
+    with contextlib.suppress(KeyboardInterrupt), interrupt as stop, pause_garbage_collection():
         while plant.time - begun < limit and not stop.asked:
             time = plant.time + plant.period
             due = start + time

@@ -207,7 +207,7 @@ class FakeBetaflight(PortFake):
             self.override and at < len(channels) and channels[at] > SWITCHED
         )  # while the channels are ours
         if self.output(opened, self.heard) and self.options.answer not in ("silent", "denied"):
-            self.witness.answered()
+            self.witness.note_answer()
 
     def _status(self) -> bytes:
         failsafe = self.plant.time - self._heard > IDLE_AFTER
@@ -250,9 +250,9 @@ class FakeBetaflight(PortFake):
         """Switch the override off."""
         self.override = False
         self.stay()
-        self.happened("override off")
+        self.note_event("override off")
 
-    def flown(self) -> np.ndarray:
+    def compute_command(self) -> np.ndarray:
         quiet = self.plant.time - self._heard
         if (
             not (self.options.all_channels or self.taken)
@@ -271,13 +271,13 @@ class FakeBetaflight(PortFake):
             if quiet <= self.window:
                 self.stay()
                 return self._target
-            self.happened("override: the pilot's sticks count again")
+            self.note_event("override: the pilot's sticks count again")
             return self.hold(self._place)
         if quiet > IDLE_AFTER:
-            self.happened("failsafe: motors idle")
+            self.note_event("failsafe: motors idle")
         if quiet > self.parameters["failsafe_delay"] + RECEIVER_HELD:
             self.armed, self.override, self._disarmed = False, False, True
-            self.happened("failsafe: disarmed")
+            self.note_event("failsafe: disarmed")
         return np.zeros(4) if quiet > IDLE_AFTER else self._target
 
     def report(self) -> dict[str, Any]:

@@ -186,7 +186,7 @@ class FakeCrazyflie(PortFake):
             return
         if arm != self.armed:
             self.armed = arm
-            self.happened("armed" if arm else "disarmed")
+            self.note_event("armed" if arm else "disarmed")
 
     def _set_parameter(self, data: bytes) -> None:
         if data[0] != FACTS["set_by_name"] or data.count(b"\0") < 2:
@@ -203,7 +203,7 @@ class FakeCrazyflie(PortFake):
             self.note_release()
             if self.options.answer == "silent":
                 return
-            self.witness.answered()
+            self.witness.note_answer()
             error = FACTS["no_entry"] if self.options.answer == "denied" else error
             self.open_mechanism()
         payload = data[: len(data) - len(rest)] + bytes([error])
@@ -249,7 +249,7 @@ class FakeCrazyflie(PortFake):
         if state == self.supervisor:
             return
         self.supervisor, self._since = state, self.plant.time
-        self.happened(state)
+        self.note_event(state)
         if state not in MAY_FLY:
             self.armed = False
 
@@ -304,7 +304,7 @@ class FakeCrazyflie(PortFake):
         """Stop all: there is no pilot beside the runner, but its emergency stop."""
         self.parameters["stabilizer.stop"] = 1
 
-    def flown(self) -> np.ndarray:
+    def compute_command(self) -> np.ndarray:
         """Return the command of this period; before the takeover a person holds the vehicle."""
         self._sense()
         self._supervise()

@@ -116,12 +116,12 @@ class FakePx4(FakeMavlink):
         ends = int(self.parameters["PWM_AUX_MAX1"]), int(self.parameters["PWM_AUX_MIN1"])
         return ends if self.parameters["PWM_AUX_FUNC1"] == FACTS["gripper_function"] else ends[::-1]
 
-    def flown(self) -> np.ndarray:
+    def compute_command(self) -> np.ndarray:
         if (
             self.mode == OFFBOARD
             and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]
         ):
-            self.happened("left OFFBOARD: no set-points")
+            self.note_event("left OFFBOARD: no set-points")
             self.enter(
                 LAND if self.parameters["COM_OBL_RC_ACT"] == px4.FACTS["loss_land"] else HOLD
             )

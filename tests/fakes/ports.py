@@ -4,7 +4,7 @@ import socket
 from abc import abstractmethod
 
 from hil.errors import LinkError
-from hil.links.device import LARGEST_DATAGRAM, UdpPort, chunks, refused
+from hil.links.device import LARGEST_DATAGRAM, UdpPort, chunks, make_port_error
 from hil.rehearsal.fake import THRUST, Fake
 
 
@@ -24,7 +24,9 @@ class ListeningPort:
         try:
             self._server = socket.create_server(("127.0.0.1", number), backlog=1)
         except OSError as error:
-            raise refused(f"tcp:127.0.0.1:{number}", number, error, "--msp-port PORT") from error
+            raise make_port_error(
+                f"tcp:127.0.0.1:{number}", number, error, "--msp-port PORT"
+            ) from error
         self._server.setblocking(False)
         self._peer: socket.socket | None = None
 

@@ -580,7 +580,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     hover = {"ardupilot": 0.1906, "px4": 0.1585, "betaflight": 0.1906}[kind]
     desk = Desk(kind, f"{kind}.thrust.hover={hover * factor}")
     check = AutopilotCheck(desk.runner.params, desk.backend)
-    desk.fake.flown = lambda: np.array([2.668, 0.0, 0.0, 0.0])
+    desk.fake.compute_command = lambda: np.array([2.668, 0.0, 0.0, 0.0])
     for _ in range(400):
         for _ in range(STEPS):
             desk.fake.step()

@@ -186,7 +186,7 @@ def test_nobody_else_speaks_for_a_crazyflie():
         ),
     ]
     for name in [*MODES, params.crazyflie.release_parameter]:
-        answer = bytes([FACTS["set_by_name"]]) + crtp.named(name) + b"\0"
+        answer = bytes([FACTS["set_by_name"]]) + crtp.encode_name(name) + b"\0"
         answers.append((FACTS["port_param"], FACTS["channel_by_name"], answer))
     for tick in range(ticks):
         backend.ask(FOLLOW, 0.02 * tick)

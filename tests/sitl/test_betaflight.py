@@ -25,7 +25,7 @@ from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
-from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, list_settings
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.commands import set_words, start
@@ -104,7 +104,7 @@ def settings(tmp_path_factory):
     """A folder with the firmware's settings, written and read back once, and what was read."""
     folder = tmp_path_factory.mktemp("firmware")
     params = load_run("betaflight_sitl").betaflight
-    return folder, Firmware(program(), folder).set_up(needed(params))
+    return folder, Firmware(program(), folder).set_up(list_settings(params))
 
 
 class Bench:
@@ -186,7 +186,7 @@ def stiff(tmp_path):
     params = load_run("betaflight_sitl").betaflight
     gains = {f"{gain}_{axis}": value for axis in ("roll", "pitch") for gain, value in STIFF.items()}
     folder = tmp_path / "stiff"
-    Firmware(program(), folder).set_up({**needed(params), **gains})
+    Firmware(program(), folder).set_up({**list_settings(params), **gains})
     desk = Bench(tmp_path, folder)
     yield desk
     desk.close()
@@ -194,7 +194,7 @@ def stiff(tmp_path):
 
 def test_settings_are_written_and_read_back(settings):
     params = load_run("betaflight_sitl").betaflight
-    assert settings[1] == needed(params)
+    assert settings[1] == list_settings(params)
     assert settings[1]["small_angle"] == "180"
     assert settings[1]["blackbox_device"] == "VIRTUAL"
 

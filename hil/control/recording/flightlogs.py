@@ -69,14 +69,14 @@ class PlayedRun:
     def _date(self, samples: list[Sample]) -> None:
         """Set the times of a body's samples."""
         stamps = np.array([sample.pose.stamp for sample in samples])
-        times = np.array([measured(sample, self.playback.params) for sample in samples])
+        times = np.array([date_by_arrival(sample, self.playback.params) for sample in samples])
         padded = np.pad(times - stamps, HALF_WINDOW, mode="edge")
         windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HALF_WINDOW + 1)
         for sample, time in zip(samples, stamps + np.median(windows, axis=1)):
             sample.time = float(time)
 
 
-def measured(sample: Sample, params: HilParams) -> float:
+def date_by_arrival(sample: Sample, params: HilParams) -> float:
     """Return the time of a pose's measurement by its arrival alone [s]."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
@@ -169,7 +169,7 @@ class TickLogger:
         pose = sample.pose
         body = sample.body
         add = self.recorder.add
-        time = measured(sample, self.params) if sample.time is None else sample.time
+        time = date_by_arrival(sample, self.params) if sample.time is None else sample.time
         time = max(time, self._times.get(body, -np.inf) + LEAST_STEP)
         self._times[body] = time
         if body == PAYLOAD:

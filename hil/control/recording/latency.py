@@ -106,7 +106,7 @@ class Stages:
         return {name: stage.summary() for name, stage in self.stages.items()}
 
 
-def slowed(speed: float) -> str:
+def describe_clock(speed: float) -> str:
     """Return whose milliseconds they are, where the run's clock is not real time; else nothing."""
     return (
         ""
@@ -119,7 +119,7 @@ def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]
     """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the
     run's clock.
     """
-    lines = [f"{'stage':11}     p50     p95     p99     max [ms]{slowed(speed)}"]
+    lines = [f"{'stage':11}     p50     p95     p99     max [ms]{describe_clock(speed)}"]
     for name, values in latency.items():
         if values:
             numbers = "".join(

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hil.control.recording.record import SUMMARY, load_run, opened, pack
+from hil.control.recording.record import SUMMARY, load_run, open_folder, pack
 from hil.control.state_machine import OperatorInput, State, TickRecord
 from hil.control.tick.runner import Runner
 from hil.links.backends.base import DryRun, Status
@@ -84,7 +84,7 @@ class Playback:
             decision,
             self._samples,
             ages,
-            not runner.latch.separated(time),
+            not runner.latch.has_separated(time),
             runner.estimator.goal_w,
         )
 
@@ -169,7 +169,7 @@ def compare_run(args: argparse.Namespace) -> int:
     """Run a recorded run again, and compare; 1 where anything differs or the recording was cut,
     else 0: ``visthrow hil replay``.
     """
-    with opened(args.folder) as folder:
+    with open_folder(args.folder) as folder:
         comparison = replay(folder)
     differences = comparison["differences"]
     for n, name, was, value in differences[:10]:

@@ -42,7 +42,7 @@ EXPECTED = f"expected {CONFIG}, {POLICY} and {TICKS} in it"
 
 
 @contextmanager
-def begun(folder: Path) -> Iterator[None]:
+def begin_folder(folder: Path) -> Iterator[None]:
     """Keep a new folder only where the run that is to write it begins; raises `StorageError` for
     one that holds a run already.
 
@@ -136,7 +136,7 @@ def lines(path: Path) -> Iterator[Any]:
                 raise RunError(f"{path}: line {number} is damaged: {error}") from error
 
 
-def with_poses(line: dict[str, Any]) -> dict[str, Any]:
+def restore_poses(line: dict[str, Any]) -> dict[str, Any]:
     """Return a line of a tick with its raw poses as such."""
     poses = []
     for stamp, arrival, body, *values in line["poses"]:
@@ -197,7 +197,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
             if not (folder / SUMMARY).is_file():
                 ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
             ticks = [line | {"poses": poses.get(line["n"], [])} for line in ticks]
-        return *setup, [with_poses(line) for line in ticks]
+        return *setup, [restore_poses(line) for line in ticks]
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{folder}: ticks or poses are damaged: {error!r}") from error
 
@@ -239,7 +239,7 @@ def pack(folder: str | Path) -> Path:
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[Path]:
+def open_folder(path: str | Path) -> Iterator[Path]:
     """Yield the folder of a run: the one that is named, or a bundle's while it is looked at; raises
     `RunError` for what is no bundle.
     """

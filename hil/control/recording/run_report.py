@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.recording.flightlogs import read, throws, whole
-from hil.control.recording.latency import Stages, draw, slowed, table
+from hil.control.recording.latency import Stages, describe_clock, draw, table
 from visthrow.common.errors import VisthrowError
 from visthrow.onboard.calibration import Calibration
 
@@ -88,7 +88,7 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             draw(
                 folder / LATENCY_PICTURE,
                 stages,
-                f"Times of each stage, run {folder.name}{slowed(speed)}",
+                f"Times of each stage, run {folder.name}{describe_clock(speed)}",
             )
             lines.append(f"{folder / LATENCY_PICTURE}  times of each stage")
         played = read(folder)

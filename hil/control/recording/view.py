@@ -29,7 +29,7 @@ from hil.control.recording.record import (
     TICKS,
     load_setup,
     require_run,
-    with_poses,
+    restore_poses,
 )
 from hil.errors import RunError
 from hil.poses.pose import PAYLOAD, VEHICLE
@@ -118,7 +118,7 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
     try:
         while going():
             finished = (folder / SUMMARY).is_file()
-            ticks = [playback.feed(with_poses(line)) for line in next(lines)]
+            ticks = [playback.feed(restore_poses(line)) for line in next(lines)]
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
                 if show is None:

@@ -206,7 +206,7 @@ class Commander:
             np.array([vehicle.rate]),
             np.array([estimate.payload.pos]),
             np.array(estimate.goal_w),
-            not parts.latch.separated(time),
+            not parts.latch.has_separated(time),
             keypoints,
             time,
         )

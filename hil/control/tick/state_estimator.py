@@ -115,7 +115,7 @@ class StateEstimator:
         if partner is None or parts.latch.at is not None or parts.machine.state not in FLYING:
             return None
         track = parts.tracks[partner]
-        pos = track.expected(pose.arrival)
+        pos = track.predict_position(pose.arrival)
         if pos is None:
             return None
         fresh = track.gate.level(pose.arrival) < HOLD

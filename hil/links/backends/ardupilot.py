@@ -67,7 +67,7 @@ class ArduPilot(MavlinkAutopilot):
         p = self.params
         return {FOLLOW: p.follow_mode, HOLD: p.hold_mode, LAND: LAND_MODE}[mode], 0.0
 
-    def _expected_modes(self) -> str:
+    def _list_modes(self) -> str:
         return "GUIDED (4) or GUIDED_NOGPS (20)" + (
             f", or {self.params.hold_mode} to take it" if self.params.take else ""
         )

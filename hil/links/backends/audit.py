@@ -51,7 +51,7 @@ class Rule:
         in_range &= self.minimum - ROUNDING <= value <= self.maximum + ROUNDING
         return equal and in_range and (not self.mask or int(value) & self.mask == self.mask)
 
-    def corrected(self, value: float) -> float:
+    def correct(self, value: float) -> float:
         """Return what is written in place of a value."""
         return int(value) | self.mask if self.mask else (*self.values, self.maximum)[0]
 
@@ -138,7 +138,7 @@ class Audit:
             self.written.append(name)
             self._written_at[name] = self._now
             del self.found[name]  # it counts when it was read back
-            self._write(name, rule.corrected(value))
+            self._write(name, rule.correct(value))
 
     def _settling(self, name: str) -> bool:
         return self._now - self._written_at.get(name, -1e9) < SETTLE

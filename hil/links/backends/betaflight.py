@@ -165,7 +165,9 @@ class Betaflight(OnPort):
             return ""
         if self.params.arm_channel:
             return (
-                f"arming disabled: {blocked(self._blocks)}" if self._blocks else "it is being armed"
+                f"arming disabled: {describe_blocks(self._blocks)}"
+                if self._blocks
+                else "it is being armed"
             )
         return "" if self._box(BOX_OVERRIDE) else "MSP OVERRIDE is off: switch it on to hand over"
 
@@ -185,7 +187,7 @@ class Betaflight(OnPort):
             return "MSP OVERRIDE is off: the pilot has it" if armed else "disarmed", WAIT
         if has_all:
             blocks = self._blocks and not self._taken
-            return f"arming disabled: {blocked(self._blocks)}" if blocks else "", WAIT
+            return f"arming disabled: {describe_blocks(self._blocks)}" if blocks else "", WAIT
         if not armed:
             return "disarmed", WAIT
         early = ours and not self._taken
@@ -432,7 +434,7 @@ def is_on(box: int, boxes: tuple[int, ...], flags: int) -> bool:
     return box in boxes and bool(flags >> boxes.index(box) & 1)
 
 
-def blocked(flags: int) -> str:
+def describe_blocks(flags: int) -> str:
     """Return what speaks against arming, in words."""
     named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
     return f"{', '.join(named) or 'ARM switch'} (flags {flags:#x})"

@@ -226,11 +226,11 @@ class Crazyflie(OnPort):
         """Take the answer to a parameter that was set."""
         release = self.params.release_parameter
         for rule in self.audit.rules:
-            if name == crtp.named(rule):
+            if name == crtp.encode_name(rule):
                 if error == 0:
                     self.audit.feed(rule, float(FACTS.get(rule, 0)))
                 else:
                     missing = error == FACTS["no_entry"]
                     self.audit.refuse(rule, NO_SUCH_PARAMETER if missing else error)
-        if name == crtp.named(release) and self.release_record.state in (PENDING, ACCEPTED):
+        if name == crtp.encode_name(release) and self.release_record.state in (PENDING, ACCEPTED):
             self.release_record.answer(error == 0, "the parameter is not known to the firmware")

@@ -157,12 +157,12 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
         """Return the command that opens the mechanism, and its parameters."""
 
-    def _stored(self, value: float, kind: int) -> float:
+    def _decode(self, value: float, kind: int) -> float:
         """Return a parameter's value out of a PARAM_VALUE's field."""
         return value
 
     def _field(self, value: float, kind: int) -> float:
-        """Return a PARAM_SET's field for a value; inverse of :meth:`_stored`."""
+        """Return a PARAM_SET's field for a value; inverse of :meth:`_decode`."""
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
@@ -202,7 +202,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     def _hear_parameter(self, message: Any, arrival: float) -> None:
         self._kinds[message.param_id] = message.param_type
-        self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
+        self.audit.feed(message.param_id, self._decode(message.param_value, message.param_type))
 
     def _hear_parameter_error(self, message: Any, arrival: float) -> None:
         self.audit.refuse(message.param_id, message.error)
@@ -270,7 +270,7 @@ class MavlinkAutopilot(Autopilot, ABC):
             return f"its checks before arming fail: {self._last_text()}", WAIT
         if role == FOLLOW or (p.take and role == HOLD):
             return "", role
-        return f"in mode {mode}; expected {self._expected_modes()}", WAIT
+        return f"in mode {mode}; expected {self._list_modes()}", WAIT
 
     def _note_taken(self, role: str | None, armed: bool) -> tuple[str, str]:
         """Return the note of a vehicle that the runner has taken."""
@@ -291,7 +291,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         return str(mode)
 
     @abstractmethod
-    def _expected_modes(self) -> str:
+    def _list_modes(self) -> str:
         """Return modes that a throw may begin in, in words."""
 
     def send(self, command: Command, host_time: float) -> bool:

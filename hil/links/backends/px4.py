@@ -72,7 +72,7 @@ class Px4(MavlinkAutopilot):
         hold = (MAIN_AUTO, AUTO_LOITER) if self.params.hold == "hold" else (MAIN_POSCTL, 0)
         return {FOLLOW: (MAIN_OFFBOARD, 0), HOLD: hold, LAND: (MAIN_AUTO, AUTO_LAND)}[mode]
 
-    def _expected_modes(self) -> str:
+    def _list_modes(self) -> str:
         return "OFFBOARD (6.0)" + (
             ", or Hold (4.3) or Position (3.0) to take it" if self.params.take else ""
         )
@@ -101,7 +101,7 @@ class Px4(MavlinkAutopilot):
         values[p.gripper - 1] = p.actuator_open
         return mav.MAV_CMD_DO_SET_ACTUATOR, (*values, 0.0)
 
-    def _stored(self, value: float, kind: int) -> float:
+    def _decode(self, value: float, kind: int) -> float:
         return parameter_value(value, kind)
 
     def _field(self, value: float, kind: int) -> float:

@@ -151,7 +151,7 @@ class MavlinkSource(Source):
         if pose is not None:
             sync = self._link.sync
             self._waiting.append(
-                pose if sync is None else sync.dated(pose, message.get_srcSystem())
+                pose if sync is None else sync.date_pose(pose, message.get_srcSystem())
             )
 
     def _drop(self, message: Any, why: str) -> None:

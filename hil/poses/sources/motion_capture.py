@@ -333,7 +333,7 @@ class NatNetSource(MocapSource):
             return
         try:
             self._client._NatNetClient__process_message(
-                bounded_buffer(self._module)(data[: HEADER.size + size])
+                bound_buffer(self._module)(data[: HEADER.size + size])
             )
         except Exception as error:  # of the package, at whatever the datagram holds
             self.roster.drop(sender, "datagram", f"does not parse ({type(error).__name__})")
@@ -356,7 +356,7 @@ class NatNetSource(MocapSource):
 
 
 @functools.cache
-def bounded_buffer(module: Any) -> Any:
+def bound_buffer(module: Any) -> Any:
     """Return the package's buffer, which believes no count that is larger than the datagram."""
 
     class BoundedBuffer(module.packet_buffer.PacketBuffer):

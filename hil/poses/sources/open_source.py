@@ -91,7 +91,7 @@ def open_source(
         return recording, None, ManualClock(recording.start)
     has_port = source.kind == "mavlink" and source.device is not None
 
-    def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
+    def open_link(named: str, device: str, tlog: str, who: list[Party]) -> Link:
         port = open_port(
             check_device(device, remote=params.link.remote),
             f"--set {named}=udp:127.0.0.1:PORT, {SENDER}",
@@ -108,14 +108,14 @@ def open_source(
     shared = source.kind == "mavlink" and not has_port
     if shared or params.backend in AUTOPILOTS:
         who = parties(params, shared, True)
-        link = opened("link.device", params.link.device, TLOG, who)
+        link = open_link("link.device", params.link.device, TLOG, who)
     if source.kind == "mocap":
         remote = params.link.remote
         capture = open_mocap(source.mocap, source.bodies, clock.now, remote, link, tell)
         return capture, link, clock
     if shared:
         return MavlinkSource(link, source.senders, clock.now), link, clock
-    poses = opened("source.device", source.device, POSES_TLOG, parties(params, True, False))
+    poses = open_link("source.device", source.device, POSES_TLOG, parties(params, True, False))
     return MavlinkSource(poses, source.senders, clock.now, link), link, clock
 
 
@@ -171,7 +171,7 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
     ours = [
         frames.pose_from_source(p)
         for p in poses
-        if not p.lost() and np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
+        if not p.is_lost() and np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
     ]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
     latest = np.maximum.accumulate([-np.inf, *(p.stamp for p in ours)])

@@ -109,7 +109,7 @@ def domain(params: MocapParams) -> Any:
         ) from error
 
 
-def placed(
+def read_placements(
     kind: str, message: Any, frames: str
 ) -> Iterator[tuple[float, tuple[float, ...], tuple[float, ...]]]:
     """Yield the stamp [s], position [m] and quaternion xyzw of a message; of TF of the transform
@@ -198,7 +198,7 @@ class Ros2Source(MocapSource):
         if not hasattr(message, "__dataclass_fields__"):  # a publisher has come or gone
             return
         try:
-            poses = list(placed(kind, message, frames))
+            poses = list(read_placements(kind, message, frames))
         except Exception as error:  # whatever the package made of what came
             self.drop(place, f"does not parse ({type(error).__name__})")
             return

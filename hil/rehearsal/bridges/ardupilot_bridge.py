@@ -125,7 +125,7 @@ class ArduPilotSitl(Bridge):
                 return frame
         return None
 
-    def flown(self) -> ndarray:
+    def compute_command(self) -> ndarray:
         return self.motors
 
     def report(self) -> dict[str, Any]:

@@ -117,12 +117,12 @@ class BetaflightSitl(Bridge):
         cycle = frame.number("<H", 0)
         armed = is_on(BOX_ARM, self._boxes, flags)
         if armed != self.armed:
-            self.happened("armed" if armed else "disarmed")
+            self.note_event("armed" if armed else "disarmed")
         self.armed = armed
         if armed and cycle:
             self.cycles.append(cycle)
 
-    def flown(self) -> ndarray:
+    def compute_command(self) -> ndarray:
         came = np.concatenate(self._outputs)
         self._outputs = []
         if len(came):

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from hil.errors import RunError
 from hil.links.backends.betaflight import FACTS, STICKS, BetaflightParams
-from hil.rehearsal.bridges.packets import at_rest, stood
+from hil.rehearsal.bridges.packets import feed_at_rest, read_answer
 from visthrow.common.toml_text import tables_beside
 
 # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
@@ -42,7 +42,7 @@ _LIBC = ctypes.CDLL(None)
 PROMPT = b"\n# "
 
 
-def needed(params: BetaflightParams) -> dict[str, str]:
+def list_settings(params: BetaflightParams) -> dict[str, str]:
     """Return the settings that a throw needs, by the name or the first words that the command line
     prints them under.
     """
@@ -103,19 +103,19 @@ class Firmware:
         """
         end = time.monotonic() + FREED
         # a connection of the last one may still be in TIME_WAIT
-        while "failed" in (words := self._started()):
+        while "failed" in (words := self._start()):
             self.stop()
             if time.monotonic() > end:
                 raise RunError(f"the firmware cannot listen: {words!r}")
             time.sleep(1.0)
-        if not stood(self.stands, START):
+        if not read_answer(self.stands, START):
             self.stop()
             raise RunError(
                 f"the firmware does not come to stand {START:g} s after its start; its words:"
                 f" {words!r}"
             )
 
-    def _started(self) -> str:
+    def _start(self) -> str:
         """Start the process; its words once it listens, or cannot."""
         try:  # nothing is connected, as the firmware serves one peer
             socket.create_server(("127.0.0.1", PORTS[0])).close()
@@ -126,7 +126,7 @@ class Firmware:
             ) from None
         self.stands, report = os.pipe()
         # by its place in the folder that it runs in: a path may hold no space
-        library = compiled(self.folder).name
+        library = compile_lockstep(self.folder).name
         environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(report)}
         # its errors; of what it prints, most are the words of its memory
         log = self.folder / "firmware.txt"
@@ -182,7 +182,7 @@ class Firmware:
         one that is not kept.
         """
         try:
-            kept = self._written(settings)
+            kept = self._write_settings(settings)
         finally:
             self.stop()
         wrong = [
@@ -194,20 +194,20 @@ class Firmware:
             raise RunError(f"the firmware did not keep its settings: {'; '.join(wrong)}")
         return kept
 
-    def _written(self, settings: dict[str, str]) -> dict[str, str]:
+    def _write_settings(self, settings: dict[str, str]) -> dict[str, str]:
         self.start()
-        with at_rest(self.stands), CommandLine() as line:
+        with feed_at_rest(self.stands), CommandLine() as line:
             for name, value in settings.items():
                 line.ask(line_of(name, value))
             line.save()
             self._end()
         self.stop()
         self.start()
-        with at_rest(self.stands), CommandLine() as line:
+        with feed_at_rest(self.stands), CommandLine() as line:
             return {name: line.read(name) for name in settings}
 
 
-def compiled(folder: Path) -> Path:
+def compile_lockstep(folder: Path) -> Path:
     """Return the library of ``lockstep.c``, compiled into a folder where it is not there yet;
     raises `RunError` without a compiler.
     """

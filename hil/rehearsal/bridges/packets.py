@@ -70,7 +70,7 @@ def sample(
     )
 
 
-def stood(stands: int, timeout: float) -> bytes:
+def read_answer(stands: int, timeout: float) -> bytes:
     """Read what a firmware in lock step writes to its pipe once it stands still; nothing where it
     does not within a time [s].
     """
@@ -117,7 +117,7 @@ class Sensors:
 
     def _run(self, packets: bytes) -> ndarray:
         self._socket.send(packets)
-        answer = stood(self._stands, PATIENCE)
+        answer = read_answer(self._stands, PATIENCE)
         if not answer:
             raise RunError(
                 f"the firmware has not come to the time {self._stamp:.3f} s of its samples after"
@@ -144,7 +144,7 @@ class Sensors:
 
 
 @contextmanager
-def at_rest(stands: int) -> Iterator[None]:
+def feed_at_rest(stands: int) -> Iterator[None]:
     """Feed a firmware with a vehicle at rest, while nothing flies yet: it calibrates its gyro and
     answers only with samples.
     """

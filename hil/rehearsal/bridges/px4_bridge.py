@@ -63,7 +63,7 @@ class Motion(NamedTuple):
     rate: ndarray
 
 
-def between(before: Motion, after: Motion, time: float) -> Motion:
+def interpolate(before: Motion, after: Motion, time: float) -> Motion:
     """Return the motion at a time between two: a cubic of places and velocities, straight lines of
     the rest.
     """
@@ -144,7 +144,7 @@ class HangingBall:
         while self._motions and self._motions[0].time < time - SLACK:
             self._now = self._motions.popleft()
         if self._motions:
-            self._now = between(self._now, self._motions[0], time)
+            self._now = interpolate(self._now, self._motions[0], time)
         if self._hangs:
             self._advance(self._mount(self._now), time)
 
@@ -218,11 +218,11 @@ class Place:
 
     def update(self, time: float, message: Any) -> tuple[ndarray, ndarray]:
         """Return place [m] and velocity [m/s] at a time [s], z up, by a HIL_STATE_QUATERNION."""
-        vel = FLIP * [rounded(v, 1e-2) for v in (message.vx, message.vy, message.vz)]
+        vel = FLIP * [estimate_truncated(v, 1e-2) for v in (message.vx, message.vy, message.vz)]
         where = [
-            rounded(message.lat, DEGREE),
-            rounded(message.lon, DEGREE),
-            rounded(message.alt, 1e-3),
+            estimate_truncated(message.lat, DEGREE),
+            estimate_truncated(message.lon, DEGREE),
+            estimate_truncated(message.alt, 1e-3),
         ]
         pos = self._scale * (where - self._origin)
         step = time - self._time
@@ -235,7 +235,7 @@ class Place:
         return pos, vel
 
 
-def rounded(count: int, unit: float) -> float:
+def estimate_truncated(count: int, unit: float) -> float:
     """Return the mean of the values that PX4 cuts to this count of a unit."""
     return unit * (count + math.copysign(0.5, count) if count else 0.0)
 
@@ -316,7 +316,7 @@ class Px4Sih(Bridge):
         """Count the poses' latency on PX4's clock, which is ahead of the ball's."""
         super().deliver(self.plant.until if self.paced else time)
 
-    def flown(self) -> ndarray:
+    def compute_command(self) -> ndarray:
         """Return nothing: PX4 flies."""
         return np.zeros(4)
 

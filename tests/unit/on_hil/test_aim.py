@@ -66,9 +66,9 @@ def test_what_is_held_back_and_when_it_is_given_up():
         assert aim.miss(1.25, near, goal) is None
         assert aim.miss(1.25, at((x, y, 1.0), (0.0, 0.0, 0.0)), goal)
     assert aim.miss(1.3, bad, goal)
-    assert (aim.given_up(1.49), aim.given_up(1.51), aim.refused) == (False, True, 7)
+    assert (aim.has_given_up(1.49), aim.has_given_up(1.51), aim.refused) == (False, True, 7)
     aim.begin()
-    assert not aim.given_up(9.0)
+    assert not aim.has_given_up(9.0)
     assert ReleaseCheck(None, AHEAD, HEIGHT, ROPE).miss(1.0, bad, goal) is None, (
         "without a table all is let go"
     )

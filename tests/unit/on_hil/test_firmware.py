@@ -10,7 +10,7 @@ from bench.processes import free_port
 from hil.errors import RunError
 from hil.rehearsal.bridges import betaflight_firmware as firmware
 from hil.rehearsal.bridges import packets
-from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
+from hil.rehearsal.bridges.betaflight_firmware import Firmware, list_settings
 from tests.configs import load_run
 
 
@@ -44,11 +44,11 @@ def test_a_program_that_ends_at_once_is_reported(tmp_path, monkeypatch):
 
 
 def test_settings_follow_the_runs_configuration(params):
-    settings = needed(params)
+    settings = list_settings(params)
     assert settings["roll_srate"] == "60"
     assert settings["yaw_srate"] == "30"
     assert settings["aux 0"] == "0 0 1700 2100 0 0"
     assert "aux 1" not in settings
     override = load_run("betaflight_sitl", ["betaflight.arm_channel=0"]).betaflight
-    assert needed(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
-    assert needed(override)["aux 1"].startswith("50 ")
+    assert list_settings(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
+    assert list_settings(override)["aux 1"].startswith("50 ")

@@ -19,7 +19,7 @@ from pytest import approx, fixture, importorskip
 
 from hil.control.latch import PayloadFlight, separation
 from hil.control.recording import flightlogs, view
-from hil.control.recording.flightlogs import measured, read, throws
+from hil.control.recording.flightlogs import date_by_arrival, read, throws
 from hil.control.recording.record import load_run
 from hil.control.recording.run_report import finish
 from tests.commands import run_python
@@ -138,7 +138,7 @@ def test_poses_of_a_clock_that_drifts_are_dated_by_their_arrivals(tmp_path):
     record_run(tmp_path / "a", save_policy(tmp_path), seconds=6.0, poses=drifting)
     played = read(tmp_path / "a")
     samples = [sample for tick in played.ticks for sample in tick.samples]
-    off = [sample.time - measured(sample, played.playback.params) for sample in samples]
+    off = [sample.time - date_by_arrival(sample, played.playback.params) for sample in samples]
     assert len(off) > 500
     assert np.abs(off).max() < 1e-3
 

@@ -18,7 +18,7 @@ def latch_of(**changes) -> Latch:
 def test_a_faster_mechanism_is_commanded_so_much_later(delay, wait):
     latch = latch_of(command_delay=delay)
     assert latch.trip(1.0, ORIGIN) == approx(1.0 + wait)
-    assert [latch.separated(1.0 + dt) for dt in (0.0, 0.049, 0.05)] == [False, False, True]
+    assert [latch.has_separated(1.0 + dt) for dt in (0.0, 0.049, 0.05)] == [False, False, True]
 
 
 def test_a_mechanism_as_slow_as_the_lag_is_taken_and_a_slower_one_refused():

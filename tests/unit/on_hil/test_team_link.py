@@ -87,7 +87,7 @@ def test_two_links_agree_over_udp_on_one_clock():
     try:
         for tick in range(8):
             for k, link in enumerate(links):
-                agreed.append(link.agreed(200.0 + tick * PERIOD - offsets[k] + 3e-3 * k))
+                agreed.append(link.agree(200.0 + tick * PERIOD - offsets[k] + 3e-3 * k))
                 link.say(RELEASE if tick >= 4 else NOTHING)
     finally:
         for link in links:
