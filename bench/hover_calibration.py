@@ -74,7 +74,7 @@ def measure_on_reference(
     controller = HoverController(HoverParams(), plant.period, count)
     rows = []
     for k in range(round((HOVER_TIME + HOVER + SWAY) / plant.period)):
-        measured = plant.measured()
+        measured = plant.measure()
         now = plant.exposed
         command = controller.step(
             measured.pos_w, measured.quat_wb, measured.vel_w, home, plant_of(flown).total_mass

@@ -318,7 +318,9 @@ def fly_all(
     paths = [folder / f"flight_{i:02d}.npz" for i in range(count)]
     todo = [(i, path) for i, path in enumerate(paths) if not path.exists()]
     text = toml_text.dumps(config.to_dict(truth, defaults=False))
-    for k, _ in enumerate(workers.done(partial(_fly_one, policy, base, text), todo, processes), 1):
+    for k, _ in enumerate(
+        workers.run_tasks(partial(_fly_one, policy, base, text), todo, processes), 1
+    ):
         say(f"flown: {k} of {len(todo)}")
     return paths
 

@@ -632,7 +632,9 @@ def main() -> None:
         return print(table(read_rows(Path(args.show))))
     cases = [case for case in (*SETS, *TRAPS, *PARTS) if args.only in case.name]
     rows: list[dict] = []
-    for _, row in workers.done(_run_index, [(case.name, args.data) for case in cases], args.jobs):
+    for _, row in workers.run_tasks(
+        _run_index, [(case.name, args.data) for case in cases], args.jobs
+    ):
         rows.append(row)
         print(f"{row['case']}: {row['overall']}", flush=True)
         if args.json:

@@ -157,7 +157,9 @@ def run(args: argparse.Namespace) -> None:
     work = load_list(args.list, tuple(args.overrides))
     out = Path(args.out)
     device = resolve(args.device)
-    known = {source.name: source for source in work.sources if source.config and source.done(out)}
+    known = {
+        source.name: source for source in work.sources if source.config and source.is_done(out)
+    }
     print(HEAD)
     for name in (args.units or ",".join(known)).split(","):
         if name not in known:

@@ -85,7 +85,7 @@ def sizes(name: str, experiment: Experiment) -> Iterator[tuple[int, list[float]]
     base = generalise(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     if not effect.applies(base) or effect.switch:
         return
-    low, high = effect.bounded(base).bounds
+    low, high = effect.bound_by(base).bounds
     for sign, most in ((1, high), (-1, -low)):
         count = int(math.log(LAST / FIRST, GROWTH)) + 1
         steps = [FIRST * GROWTH**k * effect.prior_sd for k in range(count)]

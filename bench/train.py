@@ -24,7 +24,7 @@ from bench.report import (
     rate,
 )
 from visthrow import config
-from visthrow.common.compute_device import rounded_products
+from visthrow.common.compute_device import allow_rounded_products
 from visthrow.common.errors import VisthrowError
 
 # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
@@ -74,7 +74,7 @@ def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
     return {"rollout": [r["rollout_s"] for r in rows], "learning": [r["learning_s"] for r in rows]}
 
 
-@rounded_products(True)
+@allow_rounded_products(True)
 def time_parts_alone(trainer: Any, repeats: int) -> dict[str, float]:
     """Median wall time [s] of an iteration's simulator steps, environment steps and policy calls,
     each alone.

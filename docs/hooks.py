@@ -102,15 +102,15 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, str]]:
         base = path.parent / raw["base"]
         base = base if base.exists() else config.configs_root() / raw["base"]
         below, beside = _read(base)
-        return _over(below, raw), beside | comments
+        return _merge(below, raw), beside | comments
     return raw, comments
 
 
-def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     both = {
         k: v for k, v in above.items() if isinstance(v, dict) and isinstance(below.get(k), dict)
     }
-    return below | above | {key: _over(below[key], value) for key, value in both.items()}
+    return below | above | {key: _merge(below[key], value) for key, value in both.items()}
 
 
 def _tables(cls: type, values: Any, raw: Any, sources: dict[str, str], head: str):
@@ -130,7 +130,7 @@ def _tables(cls: type, values: Any, raw: Any, sources: dict[str, str], head: str
             inner.append((part, value, stated, many.format(f"{head}{key}"), f"{head}{key}."))
             kind, value = "a table", stated if isinstance(stated, str) else "below"
         source = sources.get(head + key, "")
-        rows.append([f"`{key}`", unit, kind, f"`{_short(value)}`", meaning, source])
+        rows.append([f"`{key}`", unit, kind, f"`{_shorten(value)}`", meaning, source])
     title = f"[{head[:-1]}]" if head else f"{cls.__name__}: top level"
     yield title, _markdown(title, inspect.getdoc(cls) or "", rows)
     for part, value, stated, name, below in inner:
@@ -165,7 +165,7 @@ def _comments(cls: type) -> dict[str, str]:
     return comments
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = str(value).lower() if isinstance(value, bool) else str(value)
     return text if len(text) < 60 else text[:57] + "..."
 

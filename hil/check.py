@@ -114,7 +114,7 @@ def _listen(args: argparse.Namespace) -> int:
         + unit_problems(poses, params.frames)
         + [text for good, text in results if not good]
     )
-    lasted = runner.machine.lasting(time)
+    lasted = runner.machine.measure_hold(time)
     required = params.states.check_hold
     if not problems and lasted < required:
         problems = [

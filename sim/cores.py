@@ -13,7 +13,9 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def in_pieces(launch: Callable[[int, int], None], marks: Sequence[int], threads: int) -> None:
+def launch_in_pieces(
+    launch: Callable[[int, int], None], marks: Sequence[int], threads: int
+) -> None:
     """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, this
     thread's among them; wait for all.
 

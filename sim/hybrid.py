@@ -11,7 +11,7 @@ import warp as wp
 from numpy import ndarray
 
 from sim import solvers
-from sim.cores import cores, in_pieces
+from sim.cores import cores, launch_in_pieces
 from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.exchange import build_exchange
@@ -36,7 +36,7 @@ from sim.params import (
     ReleaseParams,
     RopeParams,
     VehicleParams,
-    changed,
+    change_values,
 )
 
 PIECES = 8
@@ -197,7 +197,7 @@ class HybridSim:
             gravity: of free fall, along -z [m/s^2]. threads: at most, of a CPU; default all cores.
         """
         if without_rope is not None:
-            params = changed(params, {"rope.segments": 1})
+            params = change_values(params, {"rope.segments": 1})
             extensions = extensions | {"push"}
             ropes = None
         self.vehicles = vehicles = vehicles or [params.vehicle]
@@ -381,7 +381,7 @@ class HybridSim:
         def launch(first: int, last: int) -> None:
             wp.launch(kernel, last - first, [first, *arguments], device=device)
 
-        in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
+        launch_in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
     def plants(self) -> tuple[ndarray, ndarray]:
         """Parameters of vehicle and rope of every environment as the kernels read them: structured
@@ -419,9 +419,9 @@ class HybridSim:
         ...).
         """
         if name in st.STATE_FIELDS:
-            return st.fetched(getattr(self.state, name))
+            return st.fetch(getattr(self.state, name))
         if name in st.OUTPUT_FIELDS:
-            return st.fetched(getattr(self.out, name))
+            return st.fetch(getattr(self.out, name))
         raise ValueError(
             f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}"
         )

@@ -35,7 +35,7 @@ GRAVITY = 9.81
 Owner = TypeVar("Owner")
 
 
-def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
+def change_values(owner: Owner, values: Mapping[str, Any]) -> Owner:
     """Return a dataclass with other values at dotted paths, such as ``vehicle.queue.delay``; paths
     within a table change the table that comes with them.
     """
@@ -48,7 +48,7 @@ def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
         else:
             fields[name] = value
     for name, inner_values in tables.items():
-        fields[name] = changed(fields.get(name, getattr(owner, name)), inner_values)
+        fields[name] = change_values(fields.get(name, getattr(owner, name)), inner_values)
     return replace(owner, **fields)  # type: ignore[type-var]
 
 

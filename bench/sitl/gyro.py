@@ -106,7 +106,7 @@ def measure_residual(logs: list[FlightLog], box: Path, folder: Path) -> list[flo
         patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY)
     )
     model = ThrowModel(
-        [log.measured() for log in logs],
+        [log.without_estimates() for log in logs],
         plant_of(config.load(Experiment, file)),
         only=["cmd_delay"],
     )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, on_grid, take_samples
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, interpolate, take_samples
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
@@ -113,7 +113,8 @@ class GimbalModel(NumericModel):
         time = stretch.time[::3]
         late = time - self.size_of(lanes, "camera_delay")[:, None]
         gap, level = (
-            on_grid(stretch.data["time"], stretch.data[name], late) for name in ("gap_b", "level")
+            interpolate(stretch.data["time"], stretch.data[name], late)
+            for name in ("gap_b", "level")
         )
         gap = gap + cross(turn[:, None], gap) - np.array(self.params.base_b)
         points = np.einsum("bnji,bnj->bni", level.reshape(*late.shape, 3, 3), gap)

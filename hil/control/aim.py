@@ -51,7 +51,7 @@ class ReleaseCheck:
         """Begin a throw."""
         self._first = None
 
-    def landing(self, payload: BodyState) -> tuple[float, float]:
+    def predict_landing(self, payload: BodyState) -> tuple[float, float]:
         """Return where a payload in this state lands if the latch trips now [m], world frame."""
         vel = payload.vel
         pos = plus(payload.pos, vel, self._delay)
@@ -75,7 +75,7 @@ class ReleaseCheck:
         """Return why a release at a time [s] is refused, or None."""
         if self._params is None:
             return None
-        x, y = self.landing(payload)
+        x, y = self.predict_landing(payload)
         error = math.hypot(x - goal_w[0], y - goal_w[1])
         if error <= self._params.bound:
             return None

@@ -88,7 +88,7 @@ class PayloadFlight:
             or pos[2] > self._points[-2][2]
         ):
             return None
-        return self._landing()
+        return self._find_landing()
 
     def overdue(self, time: float) -> Landing | None:
         """Return the landing of a payload whose poses ended shortly before the ground, by a time
@@ -99,12 +99,12 @@ class PayloadFlight:
             return None
         if time - times[-1] < POSE_TIMEOUT:
             return None
-        landing = self._landing()
+        landing = self._find_landing()
         extrapolated = landing.time - times[-1]
         landed = extrapolated < MOST_EXTRAPOLATION and landing.time < time - POSE_TIMEOUT
         return landing if landed else None
 
-    def _landing(self) -> Landing:
+    def _find_landing(self) -> Landing:
         times = np.array(self._times)
         points = np.array(self._points)
         last = times[-1]

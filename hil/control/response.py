@@ -166,9 +166,9 @@ class Response:
         self.reported += 1
         if self.reported < FEWEST_RATES:
             return
-        self._judge(_scores(self._sums, self._wandering(), self.reported))
+        self._judge(_scores(self._sums, self._measure_wandering(), self.reported))
 
-    def _wandering(self) -> ndarray:
+    def _measure_wandering(self) -> ndarray:
         """Return the variance of a reported rate from tick to tick in the autopilot's own hover
         [rad^2/s^2], shape (3,).
         """

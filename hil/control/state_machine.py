@@ -80,7 +80,7 @@ class Inputs:
     streams: tuple[str, ...] = ()  # problems of the pose streams, before the take-over
     disagrees: str | None = None  # how the first hover contradicts the policy's vehicle
 
-    def missing(self) -> list[str]:
+    def list_missing(self) -> list[str]:
         """Return what is missing before the checks begin."""
         texts = []
         if self.vehicle >= HOLD:
@@ -175,7 +175,7 @@ class Machine:
         """Return what the state waits for, in words; empty where it waits for time alone."""
         texts: list[str] = []
         if self.state in (State.IDLE, State.CHECK):
-            texts += [*inputs.missing(), *inputs.streams]
+            texts += [*inputs.list_missing(), *inputs.streams]
         if self.state in (State.CHECK, State.READY, State.ARMED):
             texts += inputs.failed_checks
         if self.state in (State.READY, State.ARMED):
@@ -203,31 +203,31 @@ class Machine:
             self._lasting_since = time
         return time - self._lasting_since >= duration - 1e-9
 
-    def lasting(self, time: float) -> float:
+    def measure_hold(self, time: float) -> float:
         """Return for how long the condition that must last has held [s]."""
         return 0.0 if self._lasting_since is None else time - self._lasting_since
 
-    def _late(self, time: float) -> bool:
+    def _is_late(self, time: float) -> bool:
         return time - self.since > getattr(self.params, self.state.value)
 
     def _idle(self, time: float, inputs: Inputs) -> None:
-        if not inputs.missing():
+        if not inputs.list_missing():
             self._go(time, State.CHECK, "poses and autopilot are there")
-        elif self._late(time) and not self.patient:
+        elif self._is_late(time) and not self.patient:
             self._go(
-                time, State.ABORT, f"{', '.join(inputs.missing())}, for {self.params.idle:g} s"
+                time, State.ABORT, f"{', '.join(inputs.list_missing())}, for {self.params.idle:g} s"
             )
 
     def _check(self, time: float, inputs: Inputs) -> None:
-        good = not (inputs.missing() or inputs.failed_checks or inputs.streams)
+        good = not (inputs.list_missing() or inputs.failed_checks or inputs.streams)
         if self._has_lasted(time, good, self.params.check_hold):
             self._go(time, State.READY, "checks passed")
-        elif self._late(time) and not self.patient:
+        elif self._is_late(time) and not self.patient:
             reason = self.waits(inputs) or "poses or autopilot come and go"
             self._go(time, State.ABORT, f"checks: {reason}")
 
     def _ready(self, time: float, inputs: Inputs) -> None:
-        if inputs.land or self._late(time):
+        if inputs.land or self._is_late(time):
             self._go_land(time, inputs, "nobody armed a throw")
         elif not (inputs.arm and inputs.following and inputs.recording):
             return
@@ -246,7 +246,7 @@ class Machine:
         self.ready_to_throw = calm and time - self.since >= self.params.armed_least
         if inputs.agreed == THROW or (self.ready_to_throw and inputs.agreed is None):
             self._go(time, State.THROW, "calm")
-        elif self._late(time):
+        elif self._is_late(time):
             reason = self.waits(inputs) or "the swing did not calm down"
             self._go(time, State.READY, f"disarmed: {reason}")
 
@@ -259,7 +259,7 @@ class Machine:
             "the payload has come off by itself": inputs.lost,
             "the policy released where it would miss": inputs.astray,
             "the team does not throw": inputs.alone,
-            "the policy did not release in time": self._late(time),
+            "the policy did not release in time": self._is_late(time),
         }
         reason = next((text for text, holds in reasons.items() if holds), "")
         if reason:
@@ -273,11 +273,11 @@ class Machine:
         elif self._has_lasted(time, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
             state = State.READY if self.throws < self.max_throws else State.LAND
             self._go(time, state, "hovering again")
-        elif inputs.land or self._late(time):
+        elif inputs.land or self._is_late(time):
             self._go_land(time, inputs, "not calm again in time")
 
     def _land(self, time: float, inputs: Inputs) -> None:
-        if inputs.grounded or self._late(time):
+        if inputs.grounded or self._is_late(time):
             self._go(time, State.DONE, "landed" if inputs.grounded else "landing took too long")
 
 

@@ -63,7 +63,7 @@ class WirePlant(Protocol):
         """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached."""
 
     @property
-    def landing(self) -> dict[str, Any]:
+    def predict_landing(self) -> dict[str, Any]:
         """landing_w, landing_time, separation_time."""
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from sim.effects.setting import AERODYNAMICS, Setting
-from sim.params import GRAVITY, changed
+from sim.params import GRAVITY, change_values
 
 SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
 # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
@@ -19,7 +19,9 @@ LONGEST_OFFSET = 0.12
 
 def _replace_in_vehicle(setting: Setting, values: dict[str, Any]) -> Setting:
     """Return a setting with other values of its vehicle."""
-    return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
+    return change_values(
+        setting, {f"plant.vehicle.{path}": value for path, value in values.items()}
+    )
 
 
 def _lagging(setting: Setting) -> Setting:
@@ -85,7 +87,7 @@ SWITCHES: dict[str, Callable[[Setting], Setting]] = {
     "proportional controller": lambda s: _replace_in_vehicle(s, {"controller.kind": "geometric"}),
     "motor lag": _lagging,
     "no motor lag": lambda s: _replace_in_vehicle(s, {"motor.kind": "instant"}),
-    "flexible rope": lambda s: changed(s, {"plant.rope.segments": SEGMENTS}),
-    "rigid rope": lambda s: changed(s, {"plant.rope.segments": 1}),
+    "flexible rope": lambda s: change_values(s, {"plant.rope.segments": SEGMENTS}),
+    "rigid rope": lambda s: change_values(s, {"plant.rope.segments": 1}),
 }
 """Name -> the setting with another kind of block."""

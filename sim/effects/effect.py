@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 from camera.field_bounds import BoundedFields, Positive
 from sim.effects.blocks import CONDITIONS, SWITCHES
 from sim.effects.setting import Setting
-from sim.params import changed
+from sim.params import change_values
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Change(BoundedFields):
             new: Any = tuple(self._new(v, theta) if i in picked else v for i, v in enumerate(value))
         else:
             new = self._new(value, theta)
-        return changed(setting, {self.path: new})
+        return change_values(setting, {self.path: new})
 
     def _new(self, value: float, theta: float) -> float:
         return value * (1.0 + self.factor * theta) if self.scale else value + self.factor * theta
@@ -159,7 +159,7 @@ class SettingEffect(Effect):
             setting = change.apply(setting, theta)
         return setting
 
-    def bounded(self, setting: Setting) -> "SettingEffect":
+    def bound_by(self, setting: Setting) -> "SettingEffect":
         """Return the effect with the lower bound that this setting's own numbers set."""
         if not self.lowest:
             return self
@@ -219,6 +219,6 @@ def possible_together(
     sizes = {}
     for name, effect in effects.items():
         if size := theta.get(name, 0.0):
-            sizes[name] = max(size, effect.bounded(setting).bounds[0])
+            sizes[name] = max(size, effect.bound_by(setting).bounds[0])
             setting = effect.apply(setting, sizes[name])
     return sizes

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from sim.params import PlantParams, SensingParams, changed
+from sim.params import PlantParams, SensingParams, change_values
 
 AERODYNAMICS = (
     "drag_x",
@@ -47,7 +47,9 @@ def generalise(setting: Setting) -> Setting:
     if vehicle.motor.kind == "first_order":
         values["motor.kind"] = "asymmetric"
         values["motor.time_constant_down"] = vehicle.motor.time_constant
-    return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
+    return change_values(
+        setting, {f"plant.vehicle.{path}": value for path, value in values.items()}
+    )
 
 
 def specialise(plant: PlantParams, before: PlantParams) -> PlantParams:
@@ -63,4 +65,4 @@ def specialise(plant: PlantParams, before: PlantParams) -> PlantParams:
         values |= {"vehicle.motor.kind": kind, "vehicle.motor.time_constant_down": 0.0}
     if before.vehicle.aero.kind == "none" and not any(getattr(aero, name) for name in AERODYNAMICS):
         values["vehicle.aero"] = before.vehicle.aero
-    return changed(plant, values)
+    return change_values(plant, values)

@@ -171,7 +171,7 @@ def _unit(x: float, y: float, z: float):
     return unit
 
 
-def _of_one(operation, first):
+def _compose_one(operation, first):
     @wp.func
     def single(a: Any):
         return operation(first(a))
@@ -179,7 +179,7 @@ def _of_one(operation, first):
     return single
 
 
-def _of_two(operation, first, second):
+def _compose_two(operation, first, second):
     @wp.func
     def pair(a: Any):
         return operation(first(a), second(a))
@@ -195,7 +195,7 @@ def quantity(name: str):
     if name in UNITS:
         return _unit(*UNITS[name])
     operation, *names = definition(name)
-    compose = _of_one if len(names) == 1 else _of_two
+    compose = _compose_one if len(names) == 1 else _compose_two
     return compose(OPERATIONS[operation], *map(quantity, names))
 
 

@@ -112,7 +112,7 @@ def put(
         )
 
 
-def fetched(array: wp.array) -> ndarray:
+def fetch(array: wp.array) -> ndarray:
     """Copy of a device array, environment first."""
     value = array.numpy()  # on the CPU a view of the simulator's memory
     return np.array(np.swapaxes(value, 0, 1) if array.ndim == 2 else value)

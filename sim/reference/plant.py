@@ -29,7 +29,7 @@ from sim.reference.quadrotor import (
 )
 from sim.reference.reference_extras import ReferenceExtras
 from sim.reference.rope import RopeDynamics
-from sim.reference.rotation_arrays import cross, quat_dot, rotation_from_quat, turned, turned_back
+from sim.reference.rotation_arrays import cross, quat_dot, rotate, rotate_back, rotation_from_quat
 from sim.reference.snapshot import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
@@ -154,8 +154,8 @@ class ReferencePlant:
         self._draw()
         rotation = rotation_from_quat(values["quat_wb"])
         offset = self._errors.com_offset
-        pos = values["pos_w"] + turned(rotation, offset)
-        vel = values["vel_w"] + turned(rotation, cross(values["rate_b"], offset))
+        pos = values["pos_w"] + rotate(rotation, offset)
+        vel = values["vel_w"] + rotate(rotation, cross(values["rate_b"], offset))
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"]
@@ -264,8 +264,8 @@ class ReferencePlant:
         the vehicles, where it is known.
         """
         rotation = rotation_from_quat(state[:, QUAT]) if rotation is None else rotation
-        arm = turned(rotation, self._ropes.mount)
-        arm_dot = turned(rotation, cross(state[:, RATE], self._ropes.mount))
+        arm = rotate(rotation, self._ropes.mount)
+        arm_dot = rotate(rotation, cross(state[:, RATE], self._ropes.mount))
         on = self._attached[:, None]
         free = state[:, FREE]
         pos = np.where(on, state[:, POS] + arm, free[:, :3])
@@ -284,8 +284,8 @@ class ReferencePlant:
         rotation = rotation_from_quat(state[:, QUAT])
         body = state[:, :BODY]
         rate_b = state[:, RATE]
-        air_b = turned_back(rotation, body[:, VEL] - wind_w)
-        near_ground = vehicle_blocks.near_ground(
+        air_b = rotate_back(rotation, body[:, VEL] - wind_w)
+        near_ground = vehicle_blocks.compute_ground_factor(
             self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
         )
         force_b, torque_b, rates[:, BLOCK_STATES], thrust = vehicle_rates(
@@ -297,7 +297,7 @@ class ReferencePlant:
             rate_b,
             near_ground,
         )
-        force_w = turned(rotation, force_b)
+        force_w = rotate(rotation, force_b)
         rates[:, :BODY] = rigid_body_rates(vehicle, body, force_w, torque_b)
         rope = self._rope_of(state)
         root = self._upper_end(state, rotation)
@@ -343,13 +343,15 @@ class ReferencePlant:
         if len(ids):
             picked = tuple(part[ids] for part in rope)
             pulled = (wrench[0][ids], wrench[1][ids])
-            rates[ids, VEL.start : RATE.stop], second[ids], stretch_dot[ids] = self._ropes.attached(
-                ids, body[ids], rotation[ids], pulled, picked, drag_w[ids]
+            rates[ids, VEL.start : RATE.stop], second[ids], stretch_dot[ids] = (
+                self._ropes.accelerate_attached(
+                    ids, body[ids], rotation[ids], pulled, picked, drag_w[ids]
+                )
             )
         flying = np.flatnonzero(~self._attached & ~self._landed & moving)
         if len(flying):
             picked = tuple(part[flying] for part in rope)
-            acceleration, second[flying], stretch_dot[flying] = self._ropes.free(
+            acceleration, second[flying], stretch_dot[flying] = self._ropes.accelerate_free(
                 flying, (root[0][flying], root[1][flying]), picked, drag_w[flying]
             )
             rates[flying, FREE] = np.hstack((root[1][flying], acceleration))
@@ -493,9 +495,9 @@ class ReferencePlant:
         landed = self._landed[:, None]
         return Snapshot(
             time=self.time,
-            pos_w=state[:, POS] - turned(rotation, offset),
+            pos_w=state[:, POS] - rotate(rotation, offset),
             quat_wb=state[:, QUAT].copy(),
-            vel_w=state[:, VEL] - turned(rotation, cross(state[:, RATE], offset)),
+            vel_w=state[:, VEL] - rotate(rotation, cross(state[:, RATE], offset)),
             rate_b=state[:, RATE].copy(),
             payload_pos_w=np.where(landed, self._landing_point, ball),
             payload_vel_w=np.where(landed, 0.0, ball_vel),
@@ -516,10 +518,10 @@ class ReferencePlant:
 
     @property
     def exposed(self) -> Snapshot:
-        """The truth of which :meth:`measured` tells."""
+        """The truth of which :meth:`measure` tells."""
         return self._samples[0][1]
 
-    def measured(self) -> Snapshot:
+    def measure(self) -> Snapshot:
         """Return the state as motion capture and gyro give it: late by the latency, with noise
         drawn anew at each call.
 

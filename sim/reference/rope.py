@@ -18,9 +18,9 @@ from sim.reference.rotation_arrays import (
     cross,
     length,
     quat_wxyz_from_matrix,
+    rotate,
+    rotate_back,
     rotation_from_direction,
-    turned,
-    turned_back,
 )
 
 RopeState = tuple[ndarray, ...]
@@ -64,7 +64,7 @@ class RopeDynamics:
         # rod by its arm.
         self._centre = np.array([-model.body_ipos[-1, 2] for model in attached])
 
-    def attached(
+    def accelerate_attached(
         self,
         ids: ndarray,
         body: ndarray,
@@ -89,13 +89,13 @@ class RopeDynamics:
             [m/s^2], shape (e,).
         """
         pose = np.hstack((body[:, :3], body[:, [6, 3, 4, 5]] / length(body[:, 3:7])))
-        wrench_w = np.hstack((wrench[0], turned(rotation, wrench[1])))
-        above = (rotation, turned(rotation, body[:, 10:13]), wrench_w)
+        wrench_w = np.hstack((wrench[0], rotate(rotation, wrench[1])))
+        above = (rotation, rotate(rotation, body[:, 10:13]), wrench_w)
         upper_damping = self.damping[ids] + self.mount_damping
         root = (pose, body[:, 7:13])
         return self._solve(self._attached, ids, root, above, upper_damping, rope, force_w)
 
-    def free(
+    def accelerate_free(
         self,
         ids: ndarray,
         root: tuple[ndarray, ndarray],
@@ -141,7 +141,7 @@ class RopeDynamics:
         rates = cross(n, rope[1])
         frames = rotation_from_direction(n)
         relative = rates - np.concatenate((rate_above[:, None], rates[:, :-1]), 1)
-        local = turned_back(frames, relative)
+        local = rotate_back(frames, relative)
         parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
         joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames)
         couples = self._couples(ids, upper_damping, relative)
@@ -165,10 +165,10 @@ class RopeDynamics:
         qacc = accelerations[ids]
         head = root[1].shape[1]
         rod_acc = qacc[:, head : head + 3 * self.segments].reshape(local.shape)
-        turning = turned(frames, rod_acc) + cross(rates, turned(frames, local))
+        turning = rotate(frames, rod_acc) + cross(rates, rotate(frames, local))
         alpha = np.cumsum(turning, axis=1)
         if head == 6:
-            alpha += turned(rotation, qacc[:, 3:6])[:, None]
+            alpha += rotate(rotation, qacc[:, 3:6])[:, None]
         second = cross(alpha, n) + cross(rates, cross(rates, n))
         elongation = qacc[:, -1] if elongations else np.zeros(len(ids))
         return qacc[:, :head], second, elongation

@@ -21,12 +21,12 @@ def length(vectors: ndarray) -> ndarray:
     return np.sqrt(np.add.reduce(vectors * vectors, -1, keepdims=True))
 
 
-def turned(rotations: ndarray, vectors: ndarray) -> ndarray:
+def rotate(rotations: ndarray, vectors: ndarray) -> ndarray:
     """Return ``R v`` over the leading axes."""
     return (rotations @ vectors[..., None])[..., 0]
 
 
-def turned_back(rotations: ndarray, vectors: ndarray) -> ndarray:
+def rotate_back(rotations: ndarray, vectors: ndarray) -> ndarray:
     """Return ``R^T v`` over the leading axes."""
     return (np.swapaxes(rotations, -1, -2) @ vectors[..., None])[..., 0]
 

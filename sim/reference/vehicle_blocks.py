@@ -276,7 +276,7 @@ def drag_torque_ratio(params: ThrustParams) -> float:
     return params.torque_ratio * params.torque_gain
 
 
-def near_ground(strength: float, radius: float, height: ndarray) -> ndarray:
+def compute_ground_factor(strength: float, radius: float, height: ndarray) -> ndarray:
     """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,).
 
     See ``AirParams``.

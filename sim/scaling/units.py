@@ -75,7 +75,7 @@ def convert_units(
         )
     dimension_of = dimensions.get(type(value).__name__, {})
 
-    def stated(name: str, item: Any) -> Any:
+    def convert(name: str, item: Any) -> Any:
         if dataclasses.is_dataclass(item) and not isinstance(item, type):
             return convert_units(item, units, dimensions)
         if item == ():
@@ -92,4 +92,4 @@ def convert_units(
         return tuple(x / size for x in item) if isinstance(item, tuple) else item / size
 
     names = [f.name for f in dataclasses.fields(value)]  # type: ignore[arg-type]
-    return type(value)(**{name: stated(name, getattr(value, name)) for name in names})
+    return type(value)(**{name: convert(name, getattr(value, name)) for name in names})

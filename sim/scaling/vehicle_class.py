@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from camera.field_bounds import BoundedFields, Positive
-from sim.params import GRAVITY, PlantParams, VehicleParams, changed
+from sim.params import GRAVITY, PlantParams, VehicleParams, change_values
 from sim.scaling.units import Units, convert_units
 
 Range = tuple[float, float]
@@ -143,7 +143,7 @@ def _calm(v: VehicleParams, share: float) -> VehicleParams:
     share = min(share, 1.0)
     names = ("p_gain", "i_gain", "feedforward_gain")
     gains = {name: (*getattr(c, name)[:2], share * getattr(c, name)[2]) for name in names}
-    return changed(v, {f"controller.{name}": gain for name, gain in gains.items()})
+    return change_values(v, {f"controller.{name}": gain for name, gain in gains.items()})
 
 
 def _product(factors: str, x: Mapping[str, float]) -> float:
@@ -174,4 +174,4 @@ def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
         values[path] = (*level, about_z * _product(factors, x))
     values["queue.delay"] = x["delay"]
     values["controller.voltage_compensation"] = x["compensation"]
-    return changed(v, values)
+    return change_values(v, values)

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, AirParams, changed
+from sim.params import GRAVITY, AirParams, change_values
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import EVERYTHING, paper_plant
@@ -25,7 +25,7 @@ DISTINCT = 10.0  # times that agreement an effect must move the payload for the 
 
 def fine(plant):
     """The plant in float64 with a step of 1 ms."""
-    return changed(plant, {"sim.precision": "float64", "sim.substep": 1e-3})
+    return change_values(plant, {"sim.precision": "float64", "sim.substep": 1e-3})
 
 
 def swing(plant, effect=None):
@@ -83,8 +83,8 @@ number of segments.
 @mark.parametrize("name", CASES)
 def test_extension_is_the_reference_plants(name):
     of_rope = name in ("payload_drag", "wind", "drag in wind")
-    plain = fine(changed(paper_plant(), {"rope.segments": 15 if of_rope else 1}))
-    extended = changed(plain, CASES[name])
+    plain = fine(change_values(paper_plant(), {"rope.segments": 15 if of_rope else 1}))
+    extended = change_values(plain, CASES[name])
     expected = swing(extended, ReferenceExtras(payload_drag=extended.rope.payload_drag))
     here = swing(extended)
     assert np.abs(here - expected).max() < AGREEMENT
@@ -127,27 +127,27 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     """A payload lets go by the rope's pull, which is less than its weight out there, with the kick
     on top of what it had.
     """
-    plant = changed(fine(paper_plant()), {"rope.segments": 1, "release.lag": 0.05})
+    plant = change_values(fine(paper_plant()), {"rope.segments": 1, "release.lag": 0.05})
     (plain, _), _ = let_go(plant)
-    early = changed(plant, {"release.lag_tension": 0.05})
+    early = change_values(plant, {"release.lag_tension": 0.05})
     opened, calm = let_go(early)
     assert opened[0] == approx(opened[1], abs=2e-4)
     assert plain - opened[0] > 5e-3
     kick = np.array([0.1, 0.0, -0.05])
-    _, kicked = let_go(changed(early, {"release.kick_w": tuple(kick)}))
+    _, kicked = let_go(change_values(early, {"release.kick_w": tuple(kick)}))
     for before, after in zip(calm, kicked):
         assert_allclose(after - before, kick, atol=1e-6)
     assert_allclose(kicked[0], kicked[1], atol=5e-3)
-    _, shot = let_go(changed(early, {"release.kick_along": 0.2}))
+    _, shot = let_go(change_values(early, {"release.kick_along": 0.2}))
     for before, after in zip(calm, shot):
         assert norm(after - before) == approx(0.2, rel=1e-6)
     assert_allclose(shot[0], shot[1], atol=5e-3)
 
 
 def test_mount_damping_is_the_joint_damping_of_a_rigid_rope():
-    plant = changed(fine(paper_plant()), {"rope.segments": 1})
-    mount = changed(plant, {"rope.joint_damping": 1e-4, "rope.mount_damping": 4e-4})
-    joint = changed(plant, {"rope.joint_damping": 5e-4})
+    plant = change_values(fine(paper_plant()), {"rope.segments": 1})
+    mount = change_values(plant, {"rope.joint_damping": 1e-4, "rope.mount_damping": 4e-4})
+    joint = change_values(plant, {"rope.joint_damping": 5e-4})
     assert np.abs(swing(mount) - swing(joint)).max() < 1e-12
 
 
@@ -158,7 +158,7 @@ def test_mount_damping_is_the_joint_damping_of_a_rigid_rope():
 def test_a_payload_flies_and_lands_as_its_equation_says(drag, side, lift, wind, extensions):
     rope = {"rope.payload_drag": drag, "rope.payload_side": side, "rope.payload_lift": lift}
     others = {"air.wind_w": wind, "release.lag": 0.0}
-    plant = changed(fine(paper_plant()), rope | others)
+    plant = change_values(fine(paper_plant()), rope | others)
     sim = HybridSim(plant, 1, extensions=extensions)
     sim.place(pos_w=np.array([[0.0, 0.0, 2.0]]), vel_w=np.array([[2.0, 1.0, 3.0]]))
     sim.set_command([[2.0, 0.0, 0.0, 0.0]], [1])
@@ -241,11 +241,11 @@ def test_a_rope_that_gives_is_a_spring(steps):
         "vehicle.battery.capacity": heavy * v.battery.capacity,
     }
     rope = {"rope.payload_offset": 0.0, "rope.payload_inertia": 1e-9, "rope.rope_mass": 1e-5}
-    plant = changed(plant, grown | rope)
+    plant = change_values(plant, grown | rope)
     tilt = np.array([np.sin(angle), 0.0, -np.cos(angle)])
 
     def hang(give: float) -> np.ndarray:
-        sim = HybridSim(changed(plant, {"rope.compliance": give}), 1, extensions=EVERYTHING)
+        sim = HybridSim(change_values(plant, {"rope.compliance": give}), 1, extensions=EVERYTHING)
         sim.place(
             pos_w=np.array([[0.0, 0.0, 5.0]]),
             cable_dir_w=np.tile(tilt, (1, plant.rope.segments, 1)),
@@ -279,4 +279,4 @@ def test_ground_effect_lifts_as_the_formula_says():
 
 def test_the_reference_refuses_what_it_does_not_know():
     with raises(ValueError, match=r"does not know release\.rope_tail"):
-        ReferencePlant(changed(paper_plant(), {"release.rope_tail": 1.0}))
+        ReferencePlant(change_values(paper_plant(), {"release.rope_tail": 1.0}))

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, mark
 
 from sim.hybrid import HybridSim
-from sim.params import PlantParams, changed
+from sim.params import PlantParams, change_values
 from sim.reference.plant import ReferencePlant
 from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor, numerics, random_commands
@@ -51,7 +51,7 @@ RELEASE = np.arange(COUNT) % 2 == 1
 
 
 def plant_of(changes: dict) -> PlantParams:
-    return changed(paper_plant(), USUAL | changes)
+    return change_values(paper_plant(), USUAL | changes)
 
 
 @mark.parametrize("name", CASES)

@@ -19,7 +19,7 @@ from pytest import approx, importorskip, mark, param, raises
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
-from sim.params import GRAVITY, LawParams, PlantParams, changed
+from sim.params import GRAVITY, LawParams, PlantParams, change_values
 from sim.solvers.mujoco import _make_on_gpu
 from tests.configs import load_experiment
 from tests.contract.test_simulator_bits import assert_same, state_of
@@ -283,7 +283,7 @@ def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
     direction = np.tile([0.0, math.sin(tilt), -math.cos(tilt)], (1, segments, 1))
     rate = np.tile([6.0, 0.0, 0.0], (1, segments, 1))
     level = np.array([[0.0, 0.0, 0.0, 1.0]])
-    exact = changed(use_solver(plant, "chain", 5e-4), {"sim.precision": "float64"})
+    exact = change_values(use_solver(plant, "chain", 5e-4), {"sim.precision": "float64"})
     chain = HybridSim(exact, 1, extensions=EVERYTHING)
     velocities = []
     for sim in (chain, HybridSim(use_solver(plant, "mujoco_warp", 5e-4), 1)):

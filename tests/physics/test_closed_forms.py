@@ -10,7 +10,7 @@ from scipy.special import ellipk
 
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
-from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams, changed
+from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams, change_values
 from tests.plants import EVERYTHING, calm, paper_plant
 from tests.simulators import bare_quadrotor, numerics, rods
 
@@ -84,7 +84,7 @@ def test_a_push_accelerates_all_that_hangs():
     """The vehicle's mass, the rope's and the ball's as well. The kernel is the one of all tests of
     extensions.
     """
-    plant = changed(paper_plant(), {"sim.precision": "float64"})
+    plant = change_values(paper_plant(), {"sim.precision": "float64"})
     sim = HybridSim(plant, 1, extensions=EVERYTHING)
     sim.set_command([[GRAVITY * plant.total_mass, 0.0, 0.0, 0.0]])
     sim.set_wrench([[0.2, 0.0, 0.0]], [[0.0, 0.0, 0.0]])

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, raises
 
-from sim.params import GRAVITY, changed
+from sim.params import GRAVITY, change_values
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import paper_plant, plain_plant
@@ -19,7 +19,7 @@ def short(plant, segments=2):
     """The same rope in few segments: the extras do not depend on their number and the tests take
     less time.
     """
-    return changed(plant, {"rope.segments": segments})
+    return change_values(plant, {"rope.segments": segments})
 
 
 def start(extras, plant=None, count=1, speed=0.0, seed=0):
@@ -109,21 +109,21 @@ def test_jitter_moves_the_switch_and_the_separation():
 
 def test_measured_is_the_state_of_before_with_noise():
     reference = start(ReferenceExtras(mocap_latency=0.03), speed=1.0)
-    assert reference.measured().pos_w[0, 0] == 0.0
+    assert reference.measure().pos_w[0, 0] == 0.0
     for _ in range(4):
         hover(reference, 1)
-    late = reference.measured()
+    late = reference.measure()
     assert late.time == approx(0.05, abs=1e-12)
     assert late.pos_w[0, 0] == approx(0.05, abs=1e-6)
     noisy = start(
         ReferenceExtras(mocap_position_sigma=1e-3, mocap_angle_sigma=1e-2, gyro_sigma=0.1),
         count=500,
     )
-    measured = noisy.measured()
+    measured = noisy.measure()
     assert (measured.pos_w - noisy.state.pos_w).std() == approx(1e-3, rel=0.1)
     assert (2.0 * measured.quat_wb[:, :3]).std() == approx(1e-2, rel=0.1)
     assert measured.rate_b.std() == approx(0.1, rel=0.1)
-    assert_array_equal(start(ReferenceExtras()).measured().pos_w, [[0.0, 0.0, 1.5]])
+    assert_array_equal(start(ReferenceExtras()).measure().pos_w, [[0.0, 0.0, 1.5]])
 
 
 def test_battery_starts_used():

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
-from sim.params import PlantParams, changed
+from sim.params import PlantParams, change_values
 from tests.plants import paper_plant
 
 CLOCK = 1e-6
@@ -16,7 +16,7 @@ PERIOD = 0.02
 
 
 def plant(lag: float) -> PlantParams:
-    return changed(paper_plant(), {"release.lag": lag})
+    return change_values(paper_plant(), {"release.lag": lag})
 
 
 def throw(sim: HybridSim, commands: np.ndarray, release_step: int) -> list[dict]:

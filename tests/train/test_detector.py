@@ -110,7 +110,7 @@ class Blind:
     def __init__(self, lost=None) -> None:
         self.looks, self.last_keypoints, self._lost = 0, None, lost or {}
 
-    def lost(self):
+    def find_lost(self):
         return self._lost
 
     def look(self, now, measured, goal_w, carried):

@@ -39,7 +39,7 @@ def _choose_device(name: str, count: int) -> str:
 
 
 @contextmanager
-def rounded_products(allowed: bool) -> Iterator[None]:
+def allow_rounded_products(allowed: bool) -> Iterator[None]:
     """Allow or forbid TF32, with a mantissa of ten bits, for float32 products on a GPU in a
     context: it suffices for networks but not for rays of keypoints.
 

@@ -98,7 +98,7 @@ class Workers:
             status("")
 
 
-def done(
+def run_tasks(
     function: Callable[[Any], Any], tasks: Iterable[Any], processes: int = 1, label: str = ""
 ) -> Iterator[tuple[int, Any]]:
     """Yield the index and the result of each task as they finish; a single process or task runs in

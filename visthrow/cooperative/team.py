@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from sim.hybrid import rope_variants
-from sim.params import changed
+from sim.params import change_values
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
@@ -100,7 +100,7 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
         delay = interpolate(team.late, part) if late else 0.0
         weakened = {"thrust.gain": tuple(gain * one for one in vehicle.thrust.gain)}
         delayed = dataclasses.replace(release, lag=release.lag + delay)
-        vehicles += [changed(vehicle, weakened), *[vehicle] * (team.vehicles - 1)]
+        vehicles += [change_values(vehicle, weakened), *[vehicle] * (team.vehicles - 1)]
         releases += [delayed, *[release] * (team.vehicles - 1)]
     ropes = rope_variants(experiment.rope, experiment.task.start)
     return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
@@ -130,7 +130,9 @@ def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
     hover |= {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
     values = {f"team.{name}": value for name, value in (hover | FAULTS[fault]).items()}
     variants = {name: getattr(start, name) for name in ("tether_variants", "tether_spread")}
-    return changed(experiment, values | {"task.start": changed(pilots_hover(), variants)})
+    return change_values(
+        experiment, values | {"task.start": change_values(pilots_hover(), variants)}
+    )
 
 
 def team_contract(experiment: TeamExperiment) -> dict[str, Any]:

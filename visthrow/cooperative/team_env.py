@@ -16,7 +16,7 @@ from torch import Tensor
 from camera import arrays
 from camera.keypoint_noise import DetectorView
 from sim.torch_bridge import TorchViews, on_torch_stream
-from visthrow.common.compute_device import rounded_products
+from visthrow.common.compute_device import allow_rounded_products
 from visthrow.common.free_fall import free_flight
 from visthrow.cooperative.team import TeamExperiment, interpolate, layout_of, members
 from visthrow.cooperative.team_sim import TeamSim
@@ -311,7 +311,7 @@ class TeamEnv(ThrowEpisodes):
         for name, value in formed.items():
             state[name].copy_(torch.where(where, value, state[name]))
 
-    @rounded_products(False)
+    @allow_rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Return the actor's and the critic's observations of the current state; ``fresh``: whether
         a row's episode begins.

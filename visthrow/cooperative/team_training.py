@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from visthrow.common.compute_device import rounded_products
+from visthrow.common.compute_device import allow_rounded_products
 from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.onboard import actions as act
@@ -61,7 +61,7 @@ class TeamTraining(PPOTraining):
         count = 0
         done = 0.0
         while done < 1.0:
-            with rounded_products(True):
+            with allow_rounded_products(True):
                 self.collect(done)
                 figures = self.learn(done)
             count += 1

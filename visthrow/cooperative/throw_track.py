@@ -108,13 +108,13 @@ def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
     """Write a recording for the rerun viewer; ``radius``: radius of the load [m]."""
     import rerun as rr
 
-    from visthrow.view.rerun_view import TIMELINE, colour_code, recording
+    from visthrow.view.rerun_view import TIMELINE, colour_code, open_recording
 
     def send(name: str, shape: type, places: Any, size: float, colour: str, **how: bool) -> None:
         thing = shape(places, radii=size, colors=[colour_code(colour)])
         stream.log(f"world/{name}", thing, **how)
 
-    with recording(path) as stream:
+    with open_recording(path) as stream:
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         send("goal", rr.Points3D, [track.goal_w], 0.03, style.GOAL, static=True)
         flight = zip(track.flight_time, track.flight_w, strict=True)

@@ -36,7 +36,7 @@ def throw(args: argparse.Namespace) -> int:
 
     Raises VisthrowError: the plant does not exist, or the policy is not a vision policy.
     """
-    from visthrow.common.workers import done
+    from visthrow.common.workers import run_tasks
     from visthrow.task.measurement import Throws
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import check_plant
@@ -53,7 +53,7 @@ def throw(args: argparse.Namespace) -> int:
         "nuisances": args.nuisances,
     }
     jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
-    flown = dict(done(partial(_throw_batch, loaded, args.plant, looks), jobs, args.jobs))
+    flown = dict(run_tasks(partial(_throw_batch, loaded, args.plant, looks), jobs, args.jobs))
     throws, counters = zip(*(flown[i] for i in range(len(jobs))))
     columns = {name: np.concatenate([part[name] for part in throws]) for name in throws[0]}
     counts = {name: sum(part[name] for part in counters) for name in counters[0]}

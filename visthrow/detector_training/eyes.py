@@ -156,7 +156,7 @@ class RenderedEyes:
         self.last_keypoints = points, valid
         return points, valid
 
-    def lost(self) -> dict[int, str]:
+    def find_lost(self) -> dict[int, str]:
         """Return vehicle -> the object, ball or goal, that was detected too rarely for a throw;
         called in a hover.
         """

@@ -39,7 +39,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
             pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
         mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
     """
-    from visthrow.logs.readers.autopilot_logs import converted_logs, log_of_autopilot
+    from visthrow.logs.readers.autopilot_logs import choose_converted_tables, log_of_autopilot
 
     path, ending = Path(path), Path(path).suffix.lower()
     if path.is_dir() and not (path / BAG).is_file():
@@ -55,7 +55,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
         from visthrow.logs.readers.blackbox.channels import logs_of_blackbox
 
         return logs_of_blackbox(path)
-    if ending in AUTOPILOTS or (mapping is None and converted_logs([path])):
+    if ending in AUTOPILOTS or (mapping is None and choose_converted_tables([path])):
         return [log_of_autopilot(path)]
     return _read_table(path, mapping)
 
@@ -76,13 +76,13 @@ def takes_mapping(path: str | Path) -> bool:
 
 def _describes_itself(path: Path) -> bool:
     """Tell whether a file, or a folder, needs no mapping."""
-    from visthrow.logs.readers.autopilot_logs import converted_logs
+    from visthrow.logs.readers.autopilot_logs import choose_converted_tables
 
     if (path / BAG).is_file():
         return False
     if path.is_dir():
-        return bool(converted_logs(path.iterdir())) or not _tables_in(path)
-    return path.suffix.lower() in SELF_DESCRIBING or bool(converted_logs([path]))
+        return bool(choose_converted_tables(path.iterdir())) or not _tables_in(path)
+    return path.suffix.lower() in SELF_DESCRIBING or bool(choose_converted_tables([path]))
 
 
 def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
@@ -110,7 +110,7 @@ def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
                 f"{file}: no part '{pattern}' among {len(names)}; {suggest(pattern, names)}"
             )
         return chosen
-    raise _missing(path)
+    raise _make_missing_error(path)
 
 
 def _refuse_pointer(path: Path) -> None:
@@ -121,7 +121,7 @@ def _refuse_pointer(path: Path) -> None:
                 raise LogError(f"{path}: a pointer of Git LFS; `git lfs pull` fetches the log")
 
 
-def _missing(path: Path) -> LogError:
+def _make_missing_error(path: Path) -> LogError:
     folder = path if path.is_dir() else path.parent
     siblings = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
     actual = "a folder, expected a file" if path.is_dir() else "no such file"
@@ -129,14 +129,14 @@ def _missing(path: Path) -> LogError:
 
 
 def _read_folder(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    from visthrow.logs.readers.autopilot_logs import converted_logs, log_of_autopilot
+    from visthrow.logs.readers.autopilot_logs import choose_converted_tables, log_of_autopilot
 
     if (path / RUN_LOG).is_file():
         return read(path / RUN_LOG)
     logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
     if logs:
         return read_all(logs)
-    if mapping is None and (tables := converted_logs(sorted(path.iterdir()))):
+    if mapping is None and (tables := choose_converted_tables(sorted(path.iterdir()))):
         return [log_of_autopilot(table) for table in tables]
     if _tables_in(path):
         return _read_table(path, mapping)
@@ -199,7 +199,7 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
                 f"{path}: {len(parts)} files; expected one: a mapping is of one table. `check` and"
                 " `explain` join logs, and a folder of tables is one recording"
             )
-        raise _missing(path)
+        raise _make_missing_error(path)
     _refuse_pointer(path)
     if path.name.lower().endswith(TABLES):
         return table_to_log.read_table(path)

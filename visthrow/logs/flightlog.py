@@ -187,7 +187,7 @@ class FlightLog:
         notes: dict[str, Any] = self.meta.get("ingest", {}).get(name, {})
         return notes
 
-    def measured(self) -> "FlightLog":
+    def without_estimates(self) -> "FlightLog":
         """Return the log without the channels that were worked out of others:
 
         ``estimated`` of the metadata names them.

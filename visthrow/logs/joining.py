@@ -66,9 +66,9 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     Raises LogError: nothing was measured in both, or it does not go together.
     """
     tried = []
-    for method, signal in (("body rates", _turning), ("speed", _velocity), ("force", _force)):
-        a = signal(first.measured())
-        b = signal(second.measured())
+    for method, signal in (("body rates", _compute_rates), ("speed", _velocity), ("force", _force)):
+        a = signal(first.without_estimates())
+        b = signal(second.without_estimates())
         if a is not None and b is not None and min(len(a[0]), len(b[0])) > RATE:
             tried.append((method, *_lag(a, b)))
     if not tried:
@@ -86,7 +86,7 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     return offset, correlation, method
 
 
-def _turning(log: FlightLog) -> Samples | None:
+def _compute_rates(log: FlightLog) -> Samples | None:
     """Body rates over ``_SPAN``: by gyro, else by attitude."""
     if "rate_b" not in log:
         return log["quat_wb"].samples().rates(_SPAN) if "quat_wb" in log else None

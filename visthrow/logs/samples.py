@@ -20,13 +20,13 @@ class Samples(NamedTuple):
         """Interpolate linearly, column by column, at times of shape (..., M): shape
         (..., M, components).
         """
-        return on_grid(self.time, self.values, times)
+        return interpolate(self.time, self.values, times)
 
     def attitudes(self, times: ndarray) -> ndarray:
         """Attitudes between samples of attitudes xyzw, unit quaternions, straight through those of
         the samples.
         """
-        between = on_grid(self.time, continuous(self.values), times)
+        between = interpolate(self.time, continuous(self.values), times)
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
     def mean_over(self, times: ndarray, span: float) -> ndarray:
@@ -34,7 +34,7 @@ class Samples(NamedTuple):
         steps = 0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.time)[:, None]
         whole = np.vstack([0.0 * self.values[:1], np.cumsum(steps, axis=0)])
         ends = np.stack([times - 0.5 * span, times + 0.5 * span])
-        begin, end = on_grid(self.time, whole, ends)
+        begin, end = interpolate(self.time, whole, ends)
         return (end - begin) / span
 
     def derivative(self, span: float = 0.06) -> "Samples":
@@ -69,7 +69,7 @@ class Samples(NamedTuple):
         return first, last, 0.5 * (time[first] + time[last]), width[whole]
 
 
-def on_grid(time: ndarray, values: ndarray, grid: ndarray) -> ndarray:
+def interpolate(time: ndarray, values: ndarray, grid: ndarray) -> ndarray:
     """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N),
     shape (..., N, C).
     """

@@ -317,7 +317,7 @@ class Policy:
         )
 
 
-def named_activation(policy: Policy, language: str, kind: str) -> str:
+def name_activation(policy: Policy, language: str, kind: str) -> str:
     """Return the name of a policy's activation in another language.
 
     Raises PolicyError: the language has none.

@@ -22,7 +22,7 @@ from numpy import ndarray
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
-from visthrow.common.workers import done
+from visthrow.common.workers import run_tasks
 
 # increased when the same unit would yield a different result; older results are then not used
 PROTOCOL = 1
@@ -244,7 +244,7 @@ def work(
     todo = list({key_of(unit): unit for unit in units if key_of(unit) not in results}.values())
     begin = time.monotonic()
     one = partial(finish, folder, function, provenance.commit(), provenance.command())
-    for count, (_, result) in enumerate(done(one, todo, processes), 1):
+    for count, (_, result) in enumerate(run_tasks(one, todo, processes), 1):
         results[result.key] = result
         remaining = (time.monotonic() - begin) / count * (len(todo) - count)
         say(f"{count} of {len(todo)} sets of throws, about {remaining:.0f} s left")

@@ -565,7 +565,7 @@ def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
     base = generalise(Setting(plant, experiment.sensing))
     effects = {
-        name: effect.bounded(base) for name, effect in choose_effects(diagnosed.effects).items()
+        name: effect.bound_by(base) for name, effect in choose_effects(diagnosed.effects).items()
     }
     plants = []
     for draw in normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T:

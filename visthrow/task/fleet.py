@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import torch
 
-from sim.params import GRAVITY, PlantParams, changed
+from sim.params import GRAVITY, PlantParams, change_values
 from sim.scaling.units import PLANT, Units, convert_units, dimensions_of
 from sim.scaling.vehicle_class import draw
 from visthrow import config
@@ -128,7 +128,7 @@ def members(experiment: Experiment) -> list[Member]:
     vehicles = []
     for plant in plants or [nominal]:
         units = fleet.units_of(plant)
-        vehicles.append(Member(changed(convert_units(plant, units), task), units))
+        vehicles.append(Member(change_values(convert_units(plant, units), task), units))
     return vehicles
 
 
@@ -155,7 +155,7 @@ def single_vehicle(experiment: Experiment, number: int = 0) -> Experiment:
         "task.observation.latency": sensors.latency,
         "task.observation.latency_jitter": sensors.latency_jitter,
     }
-    return changed(experiment, values)
+    return change_values(experiment, values)
 
 
 def specialise(

@@ -42,7 +42,7 @@ def carry_time(p: RewardParams, period: float) -> float:
     return -p.carry_time * period
 
 
-def landing(p: RewardParams, error: Tensor) -> Tensor:
+def landing_reward(p: RewardParams, error: Tensor) -> Tensor:
     """Return r_land: k_l exp(-lambda error), shape (E,). error: distance between impact and goal
     [m], shape (E,).
     """
@@ -64,7 +64,7 @@ def proximity(p: RewardParams, clearance: Tensor, margin: float) -> Tensor:
 def release_reward(
     p: RewardParams, error: Tensor, time: Tensor, clearance: Tensor, margin: float
 ) -> Tensor:
-    """Return r_land + r_tof + r_prox of a release, shape (E,). Arguments: see :func:`landing`,
+    """Return r_land + r_tof + r_prox of a release, shape (E,). Arguments: see :func:`landing_reward`,
     :func:`time_of_flight` and :func:`proximity`.
     """
-    return landing(p, error) + time_of_flight(p, time) + proximity(p, clearance, margin)
+    return landing_reward(p, error) + time_of_flight(p, time) + proximity(p, clearance, margin)

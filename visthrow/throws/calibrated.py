@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from camera.keypoints import KEYPOINTS
 from sim.cores import cores
 from visthrow.common.errors import ConfigError
-from visthrow.common.workers import done
+from visthrow.common.workers import run_tasks
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.calibration import HOVER, SWAY, Calibration, Hovered, sway, try_calibration
@@ -106,6 +106,6 @@ def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibr
     """Return the calibration of each hover; None where its data did not suffice."""
     solve = partial(try_calibration, camera=experiment.camera, contract=contract_of(experiment))
     processes = cores() if len(hovered) > TOO_FEW else 1
-    estimates = dict(done(solve, hovered, processes, "calibrations"))
+    estimates = dict(run_tasks(solve, hovered, processes, "calibrations"))
     ordered = [estimates[place] for place in range(len(hovered))]
     return [None if isinstance(one, str) else one for one in ordered]

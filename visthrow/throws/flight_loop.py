@@ -52,7 +52,7 @@ class Sight(Protocol):
                 shape (E,).
         """
 
-    def lost(self) -> dict[int, str]:
+    def find_lost(self) -> dict[int, str]:
         """Return vehicle -> the object, "ball" or "goal", that the hover's pictures did not
         show.
         """
@@ -141,7 +141,7 @@ class Policies(Pilots):
             self.eyes.look(flight.plant.exposed, snapshot, self.goal_w, snapshot.attached)
             self._lost = {
                 e: f"refused: the {name} is not seen in the hover"
-                for e, name in self.eyes.lost().items()
+                for e, name in self.eyes.find_lost().items()
             }
         return self._lost
 
@@ -286,7 +286,7 @@ class Flight:
     def _period(self, throws: bool) -> None:
         """Fly one control period: measure, decide and send."""
         plant = self.plant
-        measurement = plant.measured()
+        measurement = plant.measure()
         hold_command = self._command_hover(measurement)
         self.flown = self.open & measurement.attached & throws
         sent = Decision(hold_command, np.zeros(plant.count, bool))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sim.params import AirParams, changed
+from sim.params import AirParams, change_values
 from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
 from visthrow.onboard.policy import Policy, find_policy, flatten
@@ -74,7 +74,7 @@ def load_policy(
             f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
         ) from None
     if experiment.fleet is not None:  # fly one vehicle, that of the config
-        policy, experiment = specialise(policy, changed(experiment, {"fleet.count": 0}))
+        policy, experiment = specialise(policy, change_values(experiment, {"fleet.count": 0}))
     return Loaded(
         path.stem if path.stem != "policy" else path.resolve().parent.name,
         policy,

@@ -70,18 +70,18 @@ class Plant(Protocol):
     def state(self) -> Snapshot:
         """Return the true state."""
 
-    def measured(self) -> Snapshot:
+    def measure(self) -> Snapshot:
         """Return the measurements for the pilot, with the plant's noise and latency."""
 
     @property
     def exposed(self) -> Snapshot:
-        """Return the true state at the time of :meth:`measured`, as a camera that is triggered with
+        """Return the true state at the time of :meth:`measure`, as a camera that is triggered with
         motion capture sees it.
         """
 
     @property
     def sample(self) -> Snapshot:
-        """Return the samples of motion capture and gyro in the last :meth:`measured`; ``time`` is
+        """Return the samples of motion capture and gyro in the last :meth:`measure`; ``time`` is
         the time at which they were taken.
         """
 
@@ -284,7 +284,7 @@ class HybridPlant:
             latched=self._latched.copy(),
         )
 
-    def measured(self) -> Snapshot:
+    def measure(self) -> Snapshot:
         """Return the delayed state with the observation noise of training; for the attitude the
         noise is a rotation angle [rad].
         """
@@ -295,11 +295,11 @@ class HybridPlant:
 
     @property
     def exposed(self) -> Snapshot:
-        return _late([self.state, *self._past], self._age / self.period)
+        return _delay([self.state, *self._past], self._age / self.period)
 
     @property
     def sample(self) -> Snapshot:
-        """Return the current true state with the error of the last :meth:`measured`.
+        """Return the current true state with the error of the last :meth:`measure`.
 
         The pilot receives it with a delay, interpolated between control steps as in training. A
         real sensor does not interpolate, so a log holds this sample."""
@@ -356,9 +356,9 @@ class ReferenceAdapter:
         """Return ``time``, ``step``, ``state``, ``exposed`` and ``landing`` of the plant."""
         return getattr(self._plant, name)
 
-    def measured(self) -> Snapshot:
+    def measure(self) -> Snapshot:
         """Return the newest sample that the plant's latency lets through."""
-        self.sample = self._plant.measured()
+        self.sample = self._plant.measure()
         return self.sample
 
 
@@ -410,7 +410,7 @@ def make_plant(
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
 
 
-def _late(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
+def _delay(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
     """Return states of an age in control periods, shape (E,), interpolated linearly between
     ``states`` one period apart, newest first.
     """

@@ -213,7 +213,7 @@ def _finish(flight: Flight, recording: ThrowRecorder, recovery: float) -> Flight
     state = flight.now
     recorder = recording.recorder
     recording.add_truth(state)
-    plant.measured()
+    plant.measure()
     recording.sample(flight)
     landing = plant.landing
     failure = flight.failures[0]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy import ndarray
 
-from sim.params import changed
+from sim.params import change_values
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import rotate_back
 from visthrow.task import Experiment, plant_of
@@ -53,7 +53,7 @@ class HybridWirePlant:
         """Return the experiment with this plant's period and without latency."""
         observation = "task.observation"
         values = {f"{observation}.latency": (0.0, 0.0), f"{observation}.latency_jitter": 0.0}
-        return changed(experiment, values | {"sim.control_period": self.period})
+        return change_values(experiment, values | {"sim.control_period": self.period})
 
     def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
@@ -153,7 +153,7 @@ class HybridMotorPlant(HybridWirePlant):
     def _build(self, experiment: Experiment) -> HybridPlant:
         # the firmware's delay replaces the simulated ones
         values = {"vehicle.queue.delay": 0.0, "release.lag": MECHANISM}
-        return HybridPlant(self._fine(changed(experiment, values)), motors=True)
+        return HybridPlant(self._fine(change_values(experiment, values)), motors=True)
 
     @property
     def held(self) -> bool:

@@ -95,11 +95,12 @@ class TrainLog:
         self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
+        remaining = round(self._estimate_remaining(figures["iteration"], elapsed))
         text = (
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
             f" {timedelta(seconds=round(figures['wall_s']))},"
-            f" {timedelta(seconds=round(self._remaining(figures['iteration'], elapsed)))} left"
+            f" {timedelta(seconds=remaining)} left"
         )
         if throws is not None:
             text += (
@@ -109,7 +110,7 @@ class TrainLog:
         if throws is not None or figures["iteration"] % SAID_EVERY == 0:
             print(text, flush=True)
 
-    def _remaining(self, iteration: int, elapsed: float) -> float:
+    def _estimate_remaining(self, iteration: int, elapsed: float) -> float:
         """Return the time to the last iteration, at the speed so far, or to the limit [s]."""
         remaining = (self.last - iteration) * elapsed / max(iteration - self.done, 1)
         if self.minutes is None:

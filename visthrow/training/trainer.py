@@ -12,7 +12,7 @@ import torch
 
 from visthrow import config
 from visthrow.common import provenance
-from visthrow.common.compute_device import rounded_products
+from visthrow.common.compute_device import allow_rounded_products
 from visthrow.common.errors import CheckpointError, MismatchError, TrainError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
@@ -123,7 +123,7 @@ class Trainer:
     def _on_gpu(self) -> bool:
         return self.device.startswith("cuda")
 
-    @rounded_products(True)
+    @allow_rounded_products(True)
     def step(self) -> dict[str, float]:
         """Run one iteration; return losses, the finished episodes' means, ``rollout_s`` and
         ``learning_s`` [s].

@@ -36,7 +36,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
     Raises StorageError: the file cannot be written.
     """
-    with recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
+    with open_recording(path, blueprint(np.array(log.meta["goal_w"]), set(log.channels))) as stream:
         send_whole(stream, log, experiment)
 
 
@@ -45,13 +45,13 @@ def send_whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> N
     draw_still_parts(stream, log.meta["goal_w"], experiment)
     send(stream, log)
     if "landing" in log:
-        _landing(stream, log)
+        _send_landing(stream, log)
     for name, entity in TRAILS.items():
         _trail(stream, log, name, entity)
 
 
 @contextmanager
-def recording(
+def open_recording(
     path: str | Path, layout: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
     """Yield a stream whose content is written to a ``.rrd`` file, whole or not at all, with the
@@ -157,7 +157,7 @@ def send(stream: rr.RecordingStream, log: FlightLog) -> None:
         )
 
 
-def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
+def _send_landing(stream: rr.RecordingStream, log: FlightLog) -> None:
     label = f"{100 * log.meta['result']['error']:.1f} cm off"
     _draw(stream, "world/landing", rr.Points3D.from_fields, labels=[label])
     where = rr.Points3D.columns(positions=log["landing"].values.astype(np.float32))

@@ -312,6 +312,6 @@ def throws(played: PlayedRun) -> list[FlightLog]:
     return logs
 
 
-def whole(played: PlayedRun) -> FlightLog:
+def make_log(played: PlayedRun) -> FlightLog:
     """Return one log of the whole run."""
     return log_of(played, 0, len(played.ticks) - 1)

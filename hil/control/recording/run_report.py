@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-from hil.control.recording.flightlogs import read, throws, whole
+from hil.control.recording.flightlogs import make_log, read, throws
 from hil.control.recording.latency import Stages, describe_clock, draw, table
 from visthrow.common.errors import VisthrowError
 from visthrow.onboard.calibration import Calibration
@@ -93,7 +93,7 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
             lines.append(f"{folder / LATENCY_PICTURE}  times of each stage")
         played = read(folder)
         if not played.throws:
-            whole(played).save(folder / WHOLE)
+            make_log(played).save(folder / WHOLE)
             lines.append(f"{folder / WHOLE}  flight log of the whole run")
         for number, log in enumerate(throws(played), start=1):
             path = throw_path(folder, number, ".npz")

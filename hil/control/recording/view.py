@@ -149,7 +149,7 @@ def write(folder: str | Path, path: str | Path) -> None:
         mcap_view.write(path, log, sizes(played.playback.runner.pilot))
         return
     layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
-    with rerun_view.recording(path, layout) as stream:
+    with rerun_view.open_recording(path, layout) as stream:
         show = Show(stream, *run)
         for first in range(0, len(played.ticks), MOST_SHOWN // 10):
             show.take(played.ticks[first : first + MOST_SHOWN // 10])

@@ -176,4 +176,4 @@ class Decider:
         missing = [f"no good pose of the {n}" for n, t in tracks.items() if not t.accepted]
         if missing:
             return [*missing, *inputs.streams]
-        return [*inputs.missing(), *inputs.streams, *inputs.failed_checks]
+        return [*inputs.list_missing(), *inputs.streams, *inputs.failed_checks]

@@ -130,7 +130,7 @@ class Audit:
     def feed(self, name: str, value: float) -> None:
         """Take an answer."""
         rule = self.rules.get(name)
-        if self.done or rule is None or self._settling(name):
+        if self.done or rule is None or self._is_settling(name):
             return
         self.found[name] = value
         writes = self._write is not None and rule.write and name not in self.written
@@ -140,7 +140,7 @@ class Audit:
             del self.found[name]  # it counts when it was read back
             self._write(name, rule.correct(value))
 
-    def _settling(self, name: str) -> bool:
+    def _is_settling(self, name: str) -> bool:
         return self._now - self._written_at.get(name, -1e9) < SETTLE
 
     def service(self, host_time: float) -> None:
@@ -169,7 +169,7 @@ class Audit:
                 self._tell(self.table())
             return
         for name in missing:
-            if host_time - self._asked.get(name, -1e9) >= ASK_AGAIN and not self._settling(name):
+            if host_time - self._asked.get(name, -1e9) >= ASK_AGAIN and not self._is_settling(name):
                 self._asked[name] = host_time
                 self._ask(name)
 

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy import ndarray
 
-from sim.cores import cores, in_pieces
+from sim.cores import cores, launch_in_pieces
 from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.laws import check_laws, structure
@@ -54,7 +54,7 @@ class Recording:
         self.seconds = windows["end"] - windows["start"]
         self._uploaded: dict[tuple[rk.ReplayKernel, str], tuple] = {}
 
-    def on(self, kernel: rk.ReplayKernel, device: str) -> tuple:
+    def upload(self, kernel: rk.ReplayKernel, device: str) -> tuple:
         """Return windows and recorded data as a kernel's structs on a device."""
         if (kernel, device) not in self._uploaded:
             windows = _struct(kernel.Windows, self.windows, device)
@@ -143,7 +143,7 @@ class Replay:
         self.rows["sensings"] = pack(self.kernel.Sensing, *sensings)
         self._plants: dict[str, list] = {}
 
-    def of_rows(self, rows: dict[str, ndarray]) -> "Replay":
+    def with_rows(self, rows: dict[str, ndarray]) -> "Replay":
         """Return the same replay with other parameters, structured arrays as in ``rows``."""
         other = copy.copy(self)
         other.rows = rows
@@ -208,7 +208,7 @@ class Replay:
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         begin = _struct(k.State, starts, device)
         flown = _struct(k.Lanes, lanes, device)
-        windows, data = recording.on(k, device)
+        windows, data = recording.upload(k, device)
         before = [*self._plants_on(device), knot_spacing, begin, windows, flown, data, order]
         after = [ends, knot_states, marks, *left_at, out]
         first = 0
@@ -249,12 +249,12 @@ class Replay:
             piece.set_param_at_index(len(before), begin + first)
             piece.launch()
 
-        in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
+        launch_in_pieces(launch, _share_out(costs, PIECES * cores()), cores())
 
 
 def _read(struct: Any, kind: Any) -> dict[str, ndarray]:
     """Arrays of a struct on the host, lane first."""
-    return {name: st.fetched(getattr(struct, name)) for name in kind.vars}
+    return {name: st.fetch(getattr(struct, name)) for name in kind.vars}
 
 
 def _struct(struct: Any, values: Mapping[str, ndarray], device: str) -> Any:
@@ -268,7 +268,7 @@ def _struct(struct: Any, values: Mapping[str, ndarray], device: str) -> Any:
     return out
 
 
-def _shared_out(costs: ndarray, pieces: int) -> list[int]:
+def _share_out(costs: ndarray, pieces: int) -> list[int]:
     """Bounds of at most so many runs of lanes that cost about the same, each of at
     least one lane.
     """

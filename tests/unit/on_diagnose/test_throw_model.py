@@ -196,7 +196,7 @@ def test_the_catalogue_is_sound():
         assert e.channels, name
         assert e.source, name
         if e.applies(plant):
-            low, high = e.bounded(plant).bounds
+            low, high = e.bound_by(plant).bounds
             assert low <= 0.0 < high, name
             assert e.apply(plant, e.bounds[1] if e.switch else e.step * e.floor) != plant, name
             assert e.apply(plant, 0.0) == plant, name

@@ -39,7 +39,7 @@ def integrate_fall(pos, vel, drag):
 @mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
 def test_prediction_against_an_integrator(vel, drag):
     pos = (0.4, -0.1, 1.2)
-    landing = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(
+    landing = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).predict_landing(
         at(pos, vel)
     )
     assert landing == approx(integrate_fall(pos, vel, drag / 0.058), abs=2e-3)
@@ -47,8 +47,8 @@ def test_prediction_against_an_integrator(vel, drag):
 
 def test_a_payload_below_the_ground_or_without_end_is_judged():
     aim = ReleaseCheck(None, AHEAD, HEIGHT, ROPE)
-    assert aim.landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == approx((1.0, 2.0))
-    assert all(map(math.isfinite, aim.landing(at((1.0, 2.0, 1.0), (0.0, 0.0, 100.0)))))
+    assert aim.predict_landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == approx((1.0, 2.0))
+    assert all(map(math.isfinite, aim.predict_landing(at((1.0, 2.0, 1.0), (0.0, 0.0, 100.0)))))
 
 
 def test_what_is_held_back_and_when_it_is_given_up():

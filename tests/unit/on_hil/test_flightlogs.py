@@ -105,7 +105,7 @@ def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
         for tick in ticks[: first + 3]:
             tick["status"][3] = "wait"
 
-    command = flightlogs.whole(read(copy_run(run[0], tmp_path / "late", disarm)))["command"]
+    command = flightlogs.make_log(read(copy_run(run[0], tmp_path / "late", disarm)))["command"]
     assert command.time[~command.valid].tolist() == late
     assert len(command.time) > 10
 

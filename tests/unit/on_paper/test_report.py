@@ -182,6 +182,6 @@ def test_pictures_show_what_they_are_given():
         trade = charts.Trade("t", ((0, "f", points),), (("s", size, size),), (("c", points),))
         runs = [("g", [points.T])]
         curves = [charts.curves(panels, "y", log) for log in (False, True)]
-        return [*curves, charts.trades([trade]), charts.learning(runs)]
+        return [*curves, charts.trades([trade]), charts.draw_learning(runs)]
 
     assert all(one != other for one, other in zip(drawn(1.0), drawn(1.5), strict=True))

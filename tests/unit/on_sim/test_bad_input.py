@@ -7,7 +7,7 @@ from pytest import mark, raises
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.structs import EXTENSIONS, types
-from sim.params import AirParams, PlantParams, ReleaseParams, RopeParams, changed
+from sim.params import AirParams, PlantParams, ReleaseParams, RopeParams, change_values
 from tests.plants import paper_plant
 from tests.simulators import bare_quadrotor
 from visthrow.task import load_experiment
@@ -15,7 +15,7 @@ from visthrow.task import load_experiment
 
 def change_plant(path: str, value) -> PlantParams:
     """The paper's plant with one field, dotted, changed."""
-    return changed(paper_plant(), {path: value})
+    return change_values(paper_plant(), {path: value})
 
 
 PLANTS = [
@@ -151,10 +151,10 @@ def test_get_is_a_copy():
 
 def test_fields_that_fit_only_together_change_together():
     vehicle = {"motor.kind": "asymmetric", "motor.time_constant_down": 0.05}
-    motor = changed(paper_plant().vehicle, vehicle).motor
+    motor = change_values(paper_plant().vehicle, vehicle).motor
     assert (motor.kind, motor.time_constant_down) == ("asymmetric", 0.05)
     short = replace(paper_plant().rope, segments=3)
-    rope = changed(paper_plant(), {"rope.length": 0.5, "rope": short}).rope
+    rope = change_values(paper_plant(), {"rope.length": 0.5, "rope": short}).rope
     assert (rope.segments, rope.length) == (3, 0.5)
     with raises(TypeError, match="no_such"):
-        changed(paper_plant(), {"rope.no_such": 1.0})
+        change_values(paper_plant(), {"rope.no_such": 1.0})

@@ -20,7 +20,7 @@ def test_the_lower_bound_leaves_what_the_limit_says(share, factor, least):
     effect = next(e for e in catalogue().values() if e.lowest)
     limits = (Lowest(MASS, share, factor, least),)
     effect = replace(effect, bounds=(-9.0, 9.0), lowest=limits)
-    low, high = effect.bounded(setting).bounds
+    low, high = effect.bound_by(setting).bounds
     assert high == 9.0
     assert mass + factor * low == approx((1.0 - share) * mass + factor * least)
 
@@ -28,7 +28,7 @@ def test_the_lower_bound_leaves_what_the_limit_says(share, factor, least):
 def test_two_effects_together_keep_every_number_of_the_plant_within_its_bounds():
     setting = generalise(Setting(paper_plant()))
     effects = {
-        name: effect.bounded(setting)
+        name: effect.bound_by(setting)
         for name, effect in catalogue().items()
         if effect.changes and not effect.simpler and effect.applies(setting)
     }
@@ -40,7 +40,7 @@ def test_two_effects_together_keep_every_number_of_the_plant_within_its_bounds()
 def test_an_effect_takes_what_others_leave_of_a_number():
     setting = generalise(Setting(paper_plant()))
     names = "rotor_drag", "rotor_drag_z"
-    effects = {name: catalogue()[name].bounded(setting) for name in names}
+    effects = {name: catalogue()[name].bound_by(setting) for name in names}
     drag = setting.plant.vehicle.aero.drag_z
     sizes_together = {"rotor_drag_z": -0.75 * drag, "rotor_drag": -drag}
     with raises(ValueError, match="drag_z is -"):

@@ -12,7 +12,7 @@ from sim.effects.setting import Setting, generalise
 from sim.hybrid import HybridSim
 from sim.kernels.replay import kernel as rk
 from sim.kernels.replay.lanes import _BUILDS, Recording, Replay
-from sim.params import SensingParams, changed
+from sim.params import SensingParams, change_values
 from tests.plants import EVERYTHING, paper_plant
 
 PERIODS, RELEASED_AT = 40, 20
@@ -23,7 +23,7 @@ def plant():
     """The paper's plant in float64: its delay of 22 ms and its lag of 110 ms end steps of 2 ms, in
     both simulators alike.
     """
-    return changed(paper_plant(), {"sim.precision": "float64"})
+    return change_values(paper_plant(), {"sim.precision": "float64"})
 
 
 def one(value):
@@ -142,7 +142,7 @@ def test_commands_switch_where_they_should(flight):
     rounded to steps.
     """
     late = [0.0, 2e-4, 2e-3]
-    plants = [changed(plant(), {"vehicle.queue.delay": 0.022 + x}) for x in late]
+    plants = [change_values(plant(), {"vehicle.queue.delay": 0.022 + x}) for x in late]
     replayed, _ = replay(flight, plants, count=3, plant=np.arange(3))
     small, large = ((replayed["pos"][:, i] - replayed["pos"][:, 0]) / late[i] for i in (1, 2))
     assert np.abs(large - small).max() < 0.05 * np.abs(large).max()
@@ -165,18 +165,18 @@ def test_a_command_that_does_not_come_leaves_the_one_before(flight):
 def test_release_falls_between_steps(flight):
     """The payload's path bends at latch plus lag, to a fraction of a substep."""
     lags = [0.1037, 0.1038]
-    plants = [changed(plant(), {"release.lag": x}) for x in lags]
+    plants = [change_values(plant(), {"release.lag": x}) for x in lags]
     ends = replay(flight, plants, count=2, plant=np.arange(2), keep=np.array([0, 0]))[1].ends
     shift = ends["payload_pos_w"][1] - ends["payload_pos_w"][0]
     assert 0.0 < norm(shift) < 1e-3
-    half = [changed(plant(), {"release.lag": 0.10375})]
+    half = [change_values(plant(), {"release.lag": 0.10375})]
     middle = replay(flight, half, keep=0)[1].ends["payload_pos_w"][0] - ends["payload_pos_w"][0]
     assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
 
 
 def test_lanes_do_not_see_each_other(flight, monkeypatch):
     monkeypatch.setattr("sim.kernels.replay.lanes.cores", lambda: 2)
-    heavy = changed(plant(), {"rope.payload_mass": 0.08})
+    heavy = change_values(plant(), {"rope.payload_mass": 0.08})
     rows = np.array([0, 1, 0, 1, 1, 0, 0])
     replayed, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
     alone = [replay(flight, [x])[0]["pos"][:, 0] for x in (plant(), heavy)]
@@ -252,7 +252,7 @@ def test_rope_that_leaves_falls_with_the_payload(flight):
     """The centre of mass of payload and loose rope is a projectile; the payload, which the rope
     tugs at, is not.
     """
-    tail = changed(plant(), {"release.rope_tail": 1.0})
+    tail = change_values(plant(), {"release.rope_tail": 1.0})
     early, late = (
         replay(flight, [tail], keep=0, stamps=np.array([0.4]), end=end)[1].ends
         for end in (0.56, 0.78)
@@ -263,6 +263,6 @@ def test_rope_that_leaves_falls_with_the_payload(flight):
 
 
 def test_mixed_segments_are_refused():
-    rigid = changed(plant(), {"rope.segments": 1})
+    rigid = change_values(plant(), {"rope.segments": 1})
     with raises(ValueError, match="one number of segments"):
         Replay([plant(), rigid], [SensingParams()] * 2)

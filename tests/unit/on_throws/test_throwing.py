@@ -157,7 +157,7 @@ def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     plant = make_plant("hybrid", experiment, 400)
     truth, measured = (
         plant.state,
-        plant.measured(),
+        plant.measure(),
     )  # right after a reset nothing has moved yet, so nothing is late
     for name in MEASURED_VECTORS:
         spread = (getattr(measured, name) - getattr(truth, name)).std()
@@ -179,12 +179,12 @@ def test_measurements_of_the_hybrid_plant_are_late():
     for _ in range(5):
         before = plant.state
         plant.step(np.tile([8.0, 2.0, 0.0, 0.0], (2, 1)))
-    now, measured = plant.state, plant.measured()
+    now, measured = plant.state, plant.measure()
     for name in MEASURED_VECTORS:
         middle = 0.5 * (getattr(before, name) + getattr(now, name))
         assert_allclose(getattr(measured, name), middle, atol=1e-12)
     assert_array_equal(
-        HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w
+        HybridPlant(experiment, 2).measure().pos_w, HybridPlant(experiment, 2).state.pos_w
     )
 
 

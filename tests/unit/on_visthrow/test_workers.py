@@ -7,7 +7,7 @@ import time
 from pytest import mark, raises
 
 from visthrow.common.errors import VisthrowError
-from visthrow.common.workers import Workers, done, progress
+from visthrow.common.workers import Workers, progress, run_tasks
 
 
 def squared(number: float) -> float:
@@ -32,7 +32,7 @@ def endless(number: int) -> int:
 
 def test_one_process_works_here_and_in_order():
     processes = []
-    assert list(done(lambda x: processes.append(os.getpid()) or x, [3, 1, 2])) == [
+    assert list(run_tasks(lambda x: processes.append(os.getpid()) or x, [3, 1, 2])) == [
         (0, 3),
         (1, 1),
         (2, 2),
@@ -42,21 +42,21 @@ def test_one_process_works_here_and_in_order():
 
 @mark.slow
 def test_processes_do_each_task_once():
-    assert sorted(done(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [
+    assert sorted(run_tasks(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [
         (0, 9.0),
         (1, 1.0),
         (2, 4.0),
         (3, 25.0),
         (4, 16.0),
     ]
-    assert list(done(math.sqrt, [], 2)) == []
+    assert list(run_tasks(math.sqrt, [], 2)) == []
 
 
 @mark.slow
 @mark.parametrize(("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")])
 def test_an_error_or_a_dead_process_ends_the_work(function, message):
     with raises(VisthrowError, match=message):
-        list(done(function, [1, 2], 2))
+        list(run_tasks(function, [1, 2], 2))
 
 
 @mark.slow

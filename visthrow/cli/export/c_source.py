@@ -5,7 +5,7 @@ from pathlib import Path
 from torch import Tensor
 
 from visthrow.common.storage import atomic_write
-from visthrow.onboard.policy import Policy, named_activation
+from visthrow.onboard.policy import Policy, name_activation
 from visthrow.view.templates import render
 
 
@@ -27,7 +27,7 @@ def write_c(policy: Policy, path: str | Path) -> None:
         estimator=estimator,
         encoder=encoder,
         scale=scale,
-        activation=named_activation(policy, "c", "C expression"),
+        activation=name_activation(policy, "c", "C expression"),
     )
     atomic_write(path, source)
 

@@ -179,16 +179,16 @@ def make_plain_scenes(
     radius = 0.0012 * hangs.float()
     light = F.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
     plain["lens"] = lens_row(params.fisheye, 0.0).repeat(count, 1)
-    plain["pose"] = _flat(eye, _quat(rot_wc), torch.zeros(count, 6))
+    plain["pose"] = _join_columns(eye, _quat(rot_wc), torch.zeros(count, 6))
     plain["shutter"] = torch.zeros(count, 3)
-    plain["ball"] = _flat(ball_w.float(), params.payload_radius * size, plain["ball"])
-    plain["goal"] = _flat(goal_w[:, :2].float(), params.goal_side * size, plain["goal"])
-    plain["light"] = _flat(light.repeat(count, 1), plain["light"])
-    plain["rope"] = _flat(mount, radius, plain["rope"])
+    plain["ball"] = _join_columns(ball_w.float(), params.payload_radius * size, plain["ball"])
+    plain["goal"] = _join_columns(goal_w[:, :2].float(), params.goal_side * size, plain["goal"])
+    plain["light"] = _join_columns(light.repeat(count, 1), plain["light"])
+    plain["rope"] = _join_columns(mount, radius, plain["rope"])
     return Scenes(**plain, things=torch.zeros(count, THINGS, 12))
 
 
-def _flat(*columns: Tensor) -> Tensor:
+def _join_columns(*columns: Tensor) -> Tensor:
     """Concatenate columns, shape (F, ...) or (F, ..., n)."""
     rank = max(2, *(c.dim() for c in columns))
     return torch.cat([c if c.dim() == rank else c[..., None] for c in columns], -1)
@@ -200,11 +200,11 @@ def _draw_sensors(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     noise = n.noise * d.uniform(0.0, 1.0).square()
     seed = torch.arange(count) * 7919.0 + d.one_of(1000)
     gamma = 1.0 + n.light * d.uniform(-0.45, 0.1)
-    sensor = _flat(gain, 0.06 * noise, 0.04 * noise, gamma, torch.zeros(count), seed)
+    sensor = _join_columns(gain, 0.06 * noise, 0.04 * noise, gamma, torch.zeros(count), seed)
     exposure = n.motion * d.uniform(0.0, 0.012)
     readout = n.motion * d.uniform(0.0, 0.012)
     defocus = n.blur * d.uniform(0.0, 1.0).square() * 1.6
-    return sensor, _flat(exposure, readout, defocus)
+    return sensor, _join_columns(exposure, readout, defocus)
 
 
 def _draw_colours(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
@@ -236,25 +236,25 @@ def _hall(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> tuple[Tensor,
     texture = d.one_of(textures)
     tile = d.uniform(0.4, 3.0)
     yaw = d.uniform(0.0, 6.28)
-    ground = _flat(texture, tile, yaw, d.uniform(0.0, 2.0, 2), tint)
+    ground = _join_columns(texture, tile, yaw, d.uniform(0.0, 2.0, 2), tint)
     texture = d.one_of(textures)
     half = d.uniform(3.0, 9.0)
     height = d.uniform(3.0, 7.0)
     tile = d.uniform(1.5, 6.0)
-    walls = _flat(texture, half, height, tile, d.uniform(0.3, 1.0))
+    walls = _join_columns(texture, half, height, tile, d.uniform(0.3, 1.0))
     return torch.where(pictured, ground, scenes.ground), torch.where(pictured, walls, scenes.walls)
 
 
 def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     """Return random lights."""
     slope = d.normal(0.5, 2)
-    direction = _flat(slope, torch.ones(len(slope)))
+    direction = _join_columns(slope, torch.ones(len(slope)))
     direction = F.normalize(direction, dim=-1)
     colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
     drawn = d.chance(n.light)[:, None]
     direction = torch.where(drawn, direction, scenes.light[:, :3])
     ambient = d.uniform(0.3, 0.7)
-    return _flat(direction, ambient, colour, d.uniform(0.2, 0.8))
+    return _join_columns(direction, ambient, colour, d.uniform(0.2, 0.8))
 
 
 def draw_halls(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
@@ -301,7 +301,7 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     turn = d.uniform(0.0, 3.14, THINGS, 1)
     rim = d.uniform(0.0, 1.0, THINGS, 1)
     stays = kind * (on_ground & clear)
-    return _flat(stays, place, height, size, breadth, turn, colour, rim_from, rim)
+    return _join_columns(stays, place, height, size, breadth, turn, colour, rim_from, rim)
 
 
 def _quat(rot: Tensor) -> Tensor:

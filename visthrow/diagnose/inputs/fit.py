@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from sim.params import VehicleParams, changed
+from sim.params import VehicleParams, change_values
 from visthrow import config
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
@@ -132,7 +132,7 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
             "thrust.voltage_coefficient": size["thrust_voltage"],
             "battery.reference_voltage": stand.reference_voltage,
         }
-        return changed(base, values)
+        return change_values(base, values)
     raise DiagnoseError(
         f"'{setup.about}' is neither a vehicle nor a motor; use a setup with [flyer] or [stand]"
     )
@@ -166,7 +166,7 @@ def _vehicle_of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) ->
         values["controller.max_thrust"] = full * (1.0 + size["thrust_curve"] * (full / hover - 1.0))
     else:
         values["thrust.gain"] = tuple(gain * scale for scale in base.thrust.gain)
-    return changed(base, values)
+    return change_values(base, values)
 
 
 def write(

@@ -131,7 +131,9 @@ def throw_model(
         "simpler": args.only is not None,
     }
     return correct_interface_mistakes(
-        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **options)
+        [log.without_estimates() for log in logs],
+        plant,
+        lambda logs: ThrowModel(logs, plant, **options),
     )
 
 

@@ -24,7 +24,7 @@ from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import IDLE_PULSE
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.readers.table_to_log import lost_rows, make_channel
+from visthrow.logs.readers.table_to_log import find_lost_rows, make_channel
 from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
@@ -86,7 +86,7 @@ class Recognition:
         self.questions: list[str] = []
         self.why: dict[str, str] = {}
         for group in groups:
-            group.values = np.where(lost_rows(group.values)[:, None], np.nan, group.values)
+            group.values = np.where(find_lost_rows(group.values)[:, None], np.nan, group.values)
         self._groups = [group for group in groups if moves(group.values)]  # that no channel has
         self._entries: dict[str, ChannelMap] = {}
         self._channels: dict[str, Channel] = {}

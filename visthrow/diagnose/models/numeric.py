@@ -21,7 +21,7 @@ from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' 
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.logs.samples import on_grid as on_grid
+from visthrow.logs.samples import interpolate as interpolate
 
 EFFECT_STEP = 0.05
 """Step of the central differences by effects, in prior deviations. Second-order errors cancel, and

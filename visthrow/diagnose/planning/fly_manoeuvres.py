@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from sim.effects.effect import apply
 from sim.effects.setting import AERODYNAMICS
-from sim.params import PlantParams, changed
+from sim.params import PlantParams, change_values
 from sim.scaling.units import Units, convert_units
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
@@ -180,7 +180,7 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
         rope = replace(
             rope, length=length, payload_mass=cable.mass, mount=cable.mount, rope_mass=mass
         )
-    return replace(plant, vehicle=changed(vehicle, values), rope=rope)
+    return replace(plant, vehicle=change_values(vehicle, values), rope=rope)
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:

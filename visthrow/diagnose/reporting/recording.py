@@ -14,7 +14,7 @@ from visthrow.diagnose.reporting.pictures import left_over
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import style
-from visthrow.view.rerun_view import colour_code, recording
+from visthrow.view.rerun_view import colour_code, open_recording
 
 TIMELINE = "flight_time"
 PATHS = ("pos_w", "payload_pos_w")  # channels that are drawn in space
@@ -29,7 +29,7 @@ def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> 
     Raises StorageError: the place cannot be written.
     """
     work = diagnosis.work
-    with recording(path) as stream:
+    with open_recording(path) as stream:
         stream.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         for before, after in zip(work.before.windows, work.after.windows):
             log = logs[before.flight] if before.flight < len(logs) else None

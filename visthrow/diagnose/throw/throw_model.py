@@ -390,7 +390,7 @@ def effects_for(
         if of_payload and "payload_pos_w" not in channels:
             continue
         if missing.isdisjoint(e.channels):
-            chosen[name] = e.bounded(setting)
+            chosen[name] = e.bound_by(setting)
     return chosen
 
 

@@ -121,7 +121,7 @@ def excitation(log: FlightLog) -> dict[str, float]:
     _motion(log, figures, flown)
     _thrust(log, figures, flown)
     _payload(log, figures)
-    _standing(log, figures)
+    _note_standstill(log, figures)
     return figures
 
 
@@ -200,7 +200,7 @@ def _payload(log: FlightLog, figures: dict) -> None:
         figures["releases"] = float(np.sum(np.diff(pressed.astype(int)) > 0))
 
 
-def _standing(log: FlightLog, figures: dict) -> None:
+def _note_standstill(log: FlightLog, figures: dict) -> None:
     _, place = _find_first(log, POSITIONS)
     name, thrust = _find_first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 1)
     idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0

@@ -81,7 +81,7 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
     yield from _check_same_quantity(log)
 
 
-def usable(samples: Samples | None, threshold: float) -> bool:
+def is_usable(samples: Samples | None, threshold: float) -> bool:
     """Tell whether there are enough samples, of something that moves by more than a threshold."""
     if samples is None or len(samples.time) <= 50:
         return False
@@ -157,7 +157,7 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
 def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
     place = log[pos].samples()
     velocity = log[vel].samples()
-    if not (usable(place, 0.02) and usable(velocity, 0.0)):
+    if not (is_usable(place, 0.02) and is_usable(velocity, 0.0)):
         return
     message = log.notes(pos).get("message")
     one_clock = message is not None and message == log.notes(vel).get("message")
@@ -167,8 +167,8 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
 def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
     measured = log.samples("rate_b")
     derived = _steady_rates(log[quat].samples())
-    turns = usable(derived, MOVES) or usable(measured, MOVES)
-    if turns and usable(derived, 0.0) and usable(measured, 0.0):
+    turns = is_usable(derived, MOVES) or is_usable(measured, MOVES)
+    if turns and is_usable(derived, 0.0) and is_usable(measured, 0.0):
         yield from _compare(derived, measured, f"rate of {quat}, rate_b")
 
 
@@ -199,11 +199,11 @@ def _compare(
         )
         yield Row("frames", channels, "bad", text, figures)
         return
-    if _turned(relation):
+    if _is_turned(relation):
         yield _report_other_axes(relation, channels, "go together")
         return
     yield from _together_rows(relation, channels, figures, (0.67, 1.5))
-    yield _late(relation, channels, figures, one_clock)
+    yield _report_delay(relation, channels, figures, one_clock)
 
 
 def _together_rows(
@@ -237,7 +237,7 @@ def _figures(relation: relations.Relation) -> dict[str, float]:
     }
 
 
-def _turned(relation: relations.Relation) -> bool:
+def _is_turned(relation: relations.Relation) -> bool:
     return relation.nats > _NATS and relation.axes_correlation > relation.correlation + CLEARLY
 
 
@@ -254,7 +254,9 @@ def _better(relation: relations.Relation, whose: str = "") -> str:
     return text + f"(correlation {relation.axes_correlation:.2f}, not {relation.correlation:.2f})"
 
 
-def _late(relation: relations.Relation, channels: str, figures: dict, one_clock: bool) -> Row:
+def _report_delay(
+    relation: relations.Relation, channels: str, figures: dict, one_clock: bool
+) -> Row:
     """Report the delay of a second measurement of one motion, and its remedy."""
     if relation.delay_sd > _UNTOLD:
         text = "how late the second is cannot be determined: too slow, or too noisy"
@@ -350,16 +352,18 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
             return
         time = time[hangs]
         acc = _together(acc[hangs], relative[hangs], turn[hangs])
-        acc, pushed = _leaning(acc, turn[hangs])
+        acc, pushed = _compute_leans(acc, turn[hangs])
     relation = relations.relate(Samples(time, acc), Samples(time, pushed))
     if relation is None:
         return
     wrong = _report_exchange(relation, channels)
     if wrong is None:
         velocity = motion.derivative(_SPAN) if log[path].unit == "m" else motion
-        wrong = _turned_path(headings.turn_of(time, acc, pushed, velocity.at(time)), channels)
+        wrong = _report_turned_path(
+            headings.turn_of(time, acc, pushed, velocity.at(time)), channels
+        )
     if wrong is None and sensed:
-        wrong = _turned_body(Samples(time, acc), attitude, force_b, channels)
+        wrong = _report_turned_body(Samples(time, acc), attitude, force_b, channels)
     if wrong is not None:
         yield wrong
     else:
@@ -384,7 +388,7 @@ def _list_unchecked(acc: np.ndarray) -> Iterator[Row]:
             yield Row("answers", f"mirrored {axis}", "warn", text, {"share": part})
 
 
-def _turned_path(turn: headings.Turn, channels: str) -> Row | None:
+def _report_turned_path(turn: headings.Turn, channels: str) -> Row | None:
     """Return a row where positions and velocities are surely turned about z."""
     if turn.nats < _NATS or turn.alone < CLEARLY:
         return None
@@ -430,7 +434,7 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     return acc + share * relative
 
 
-def _leaning(acc: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_leans(acc: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return accelerations and the push of a thrust along body z that carries them, both level
     [m/s^2], shape (N, 3).
     """
@@ -499,7 +503,9 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
     return _LevelForces(plain, turned, mirrored, size, relations.relate(*best, reach=_DELAY_BAD))
 
 
-def _turned_body(acc: Samples, attitude: Samples, force_b: Samples, channels: str) -> Row | None:
+def _report_turned_body(
+    acc: Samples, attitude: Samples, force_b: Samples, channels: str
+) -> Row | None:
     """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
     feel drag and cable alone; z, which feels the thrust, is left out.
     """
@@ -575,7 +581,7 @@ def _check_push(
         return
     yield from _together_rows(relation, channels, figures, _FORCES)
     if sensed:
-        yield _late(relation, channels, figures, False)
+        yield _report_delay(relation, channels, figures, False)
         if np.linalg.norm(off) > _OFFSET:
             text = (
                 f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean:"
@@ -587,7 +593,7 @@ def _check_push(
 def _report_exchange(relation: relations.Relation, channels: str) -> Row | None:
     """Report a path that goes with the push in other axes."""
     firm = relation.axes_correlation > _CORRELATED and relation.nats > _SHARED * _NATS
-    if not firm or not _turned(relation):
+    if not firm or not _is_turned(relation):
         return None
     text = f"fit with {_better(relation, ' of positions and velocities')}"
     figures = {"axes": relation.axes, "of": "path", "nats": relation.nats}
@@ -619,7 +625,7 @@ def _commands(log: FlightLog) -> Iterator[Row]:
         rates = log["quat_wb"].samples().rates()
     else:
         return
-    if not usable(rates, MOVES):
+    if not is_usable(rates, MOVES):
         return
     spread = np.max(np.std(rates.values, axis=0))
     for name in ("command", "rate_setpoint_b"):
@@ -627,15 +633,15 @@ def _commands(log: FlightLog) -> Iterator[Row]:
             continue
         time, values = log[name].samples()
         set_points = Samples(time, values[:, -3:])  # a command's first is thrust
-        relation = relations.relate(set_points, rates) if usable(set_points, MOVES) else None
+        relation = relations.relate(set_points, rates) if is_usable(set_points, MOVES) else None
         if relation is not None:
             channels = f"{name}, {turning}"
-            early = _early(relation, set_points, rates, channels)
+            early = _report_early_rates(relation, set_points, rates, channels)
             period = max(np.median(np.diff(clock)) for clock in (time, rates.time))
             yield early or _check_following(relation, channels, spread, period)
 
 
-def _early(
+def _report_early_rates(
     relation: relations.Relation, set_points: Samples, rates: Samples, channels: str
 ) -> Row | None:
     """Report rates that go before their commands: if no delay that a controller has fits them as
@@ -682,7 +688,7 @@ def _check_following(
             f" (best correlation {relation.axes_correlation:.2f}): not the same flight?"
         )
         return Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)
-    if _turned(relation):
+    if _is_turned(relation):
         return _report_other_axes(relation, channels, "the rates follow the commands")
     is_measured = relation.delay_sd < _UNTOLD
     early = is_measured and relation.delay < -0.005
@@ -759,7 +765,7 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         yield _length(middle, vehicle.cable_length, channels)
     yield from _check_early_release(log, payload.time, gap)
     hung = Samples(payload.time[hanging], payload.values[hanging])
-    yield from _payload_late(place, hung, channels)
+    yield from _report_payload_delay(place, hung, channels)
 
 
 def _check_early_release(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:
@@ -799,7 +805,7 @@ def _length(middle: float, expected: float, channels: str) -> Row:
     return Row("cable", channels, verdict, text, figures)
 
 
-def _payload_late(place: Samples, payload: Samples, channels: str) -> Iterator[Row]:
+def _report_payload_delay(place: Samples, payload: Samples, channels: str) -> Iterator[Row]:
     """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
     overlap = (payload.time > place.time[0] + 0.2) & (payload.time < place.time[-1] - 0.2)
@@ -832,7 +838,7 @@ def _check_same_quantity(log: FlightLog) -> Iterator[Row]:
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         a = log.samples(first)
         b = log.samples(second)
-        if not (usable(a, MOVES) and usable(b, MOVES)):
+        if not (is_usable(a, MOVES) and is_usable(b, MOVES)):
             continue
         rows = list(_compare(a, b, f"{first}, {second}"))
         yield from rows
@@ -841,7 +847,7 @@ def _check_same_quantity(log: FlightLog) -> Iterator[Row]:
             yield from _drift(a, b, f"{first}, {second}")
 
 
-def _within(samples: Samples, start: float, end: float) -> Samples:
+def _cut(samples: Samples, start: float, end: float) -> Samples:
     rows = (samples.time >= start) & (samples.time < end)
     return Samples(samples.time[rows], samples.values[rows])
 
@@ -852,9 +858,9 @@ def _drift(first: Samples, second: Samples, channels: str) -> Iterator[Row]:
     delays = []
     piece = 5.0
     for start in np.arange(first.time[0], first.time[-1] - piece, piece):
-        a = _within(first, start, start + piece)
-        b = _within(second, start - 1.0, start + piece + 1.0)
-        if not usable(a, MOVES) or len(b.time) < 50:
+        a = _cut(first, start, start + piece)
+        b = _cut(second, start - 1.0, start + piece + 1.0)
+        if not is_usable(a, MOVES) or len(b.time) < 50:
             continue
         relation = relations.relate(a, b)
         if relation is not None and relation.correlation > 0.8 and relation.delay_sd < DELAY_KNOWN:

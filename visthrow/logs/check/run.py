@@ -58,7 +58,7 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
     and channel; a bad row about one of them is no reason."""
     reasons = []
     for checked in results:
-        ignored = unread - _agreeing(checked, unread)
+        ignored = unread - _find_agreeing(checked, unread)
         for row in checked.rows:
             refuses = row.topic in CONTRADICT or "never overlap" in row.text
             about = {row.name, *re.findall(r"\w+", row.channel)}
@@ -67,7 +67,7 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
     return reasons
 
 
-def _agreeing(checked: Checked, unread: frozenset[str]) -> set[str]:
+def _find_agreeing(checked: Checked, unread: frozenset[str]) -> set[str]:
     """Return velocities that go with a position that the model reads: what contradicts them
     contradicts the position.
     """
@@ -103,7 +103,7 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if not log.channels:
         yield Row("clock", "", "bad", "no channel at all")
         return
-    log = _until_landing(log)
+    log = _cut_at_landing(log)
     yield from _reader(log)
     for name, channel in log.channels.items():
         yield from signals.look(name, channel, log.notes(name))
@@ -128,7 +128,7 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     yield from excitation.look(whole)
 
 
-def _until_landing(log: FlightLog) -> FlightLog:
+def _cut_at_landing(log: FlightLog) -> FlightLog:
     """Without the payload's samples after its landing: what lies on the floor stands still."""
     if "landing" not in log or not len(log["landing"].time):
         return log
@@ -217,7 +217,7 @@ def _compare_shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, R
         if path is not None and len(paths) < _MOST_PAIRED:
             paths[i] = path
     for (first, a), (second, b) in combinations(paths.items(), 2):
-        if not (physics.usable(a, physics.MOVES) or physics.usable(b, physics.MOVES)):
+        if not (physics.is_usable(a, physics.MOVES) or physics.is_usable(b, physics.MOVES)):
             continue
         # on a straight path an offset of positions looks like a delay; velocities have none
         relation = relations.relate(a.derivative(), b.derivative())

@@ -190,7 +190,7 @@ def _values(name: str, channel: Channel) -> Iterator[Row]:
         return
     measured = "setpoint" not in name
     if measured and _speaks_of(name, _NEVER_STUCK):
-        yield from _stuck(name, values, time)
+        yield from _report_stuck(name, values, time)
     if measured and _speaks_of(name, _RAILED) and name not in _SWITCHES:
         yield from _check_rails(name, values)
     if channel.unit in _FASTEST and not _speaks_of(name, _COMMANDED):
@@ -202,7 +202,7 @@ def _speaks_of(name: str, words: tuple[str, ...]) -> bool:
     return any(word in name for word in words)
 
 
-def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
+def _report_stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
     same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
     if not np.any(same):
         return

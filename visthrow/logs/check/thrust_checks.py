@@ -17,8 +17,8 @@ from visthrow.logs.check.physics import (
     MOVES,
     accelerations,
     hangs,
+    is_usable,
     sparse,
-    usable,
 )
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import FlightLog
@@ -68,7 +68,7 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
     """Yield the findings about thrust and rotors in one flight."""
     yield from _force(log, vehicle)
     yield from _rotors(log)
-    yield from _turning(log)
+    yield from _check_turn_direction(log)
 
 
 def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Samples] | None:
@@ -164,7 +164,7 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     mass = mass_of(log, vehicle)
     measurement = "acc_b"
     if mass is None and vehicle.mass:
-        mass = _mass_by(log, vehicle, _along_path(log))
+        mass = _mass_by(log, vehicle, _filter_path_force(log))
         measurement = "path"
     if mass is not None:
         yield _weight(mass, vehicle, f"{name}, {measurement}")
@@ -175,10 +175,12 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         return
     correlations = list(_correlations(log, command))
     if correlations:
-        yield _following(name, *max(correlations, key=lambda following: np.max(following[1])))
+        yield _report_following(
+            name, *max(correlations, key=lambda following: np.max(following[1]))
+        )
 
 
-def _following(name: str, measurement: str, curve: np.ndarray, against: float) -> Row:
+def _report_following(name: str, measurement: str, curve: np.ndarray, against: float) -> Row:
     """Report how the measured force follows a thrust, by their correlation at each delay and the
     nats by which no thrust explains the force better.
     """
@@ -220,7 +222,7 @@ def _following(name: str, measurement: str, curve: np.ndarray, against: float) -
     return Row("frames", channels, "warn", f"{text}, or noise", figures)
 
 
-def _along_z(log: FlightLog, measurement: str) -> Samples | None:
+def _measure_force_z(log: FlightLog, measurement: str) -> Samples | None:
     """Return the specific force along body z [m/s^2], shape (N, 1), by the accelerometer or by the
     path.
     """
@@ -240,9 +242,9 @@ def _along_z(log: FlightLog, measurement: str) -> Samples | None:
     return Samples(time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3])
 
 
-def _along_path(log: FlightLog) -> Samples | None:
+def _filter_path_force(log: FlightLog) -> Samples | None:
     """Return the specific force along body z by the path, without what its jumps make of it."""
-    force_z = _along_z(log, "path")
+    force_z = _measure_force_z(log, "path")
     if force_z is None:
         return None
     return Samples(force_z.time, _trim(force_z.values.T).T)
@@ -260,7 +262,7 @@ def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.nd
     flies = command.time[thrust > 0.6 * usual]
     changes = _load_changes(log)
     for measurement in ("acc_b", "path"):
-        force = _along_z(log, measurement)
+        force = _measure_force_z(log, measurement)
         if force is None:
             continue
         start = max(flies[0] + 0.5, force.time[0] + 0.3)
@@ -367,12 +369,12 @@ def _uneven(ratio: float) -> str:
     return f"{word}no trim explains it; a sensor (pole pairs, a lost wire), or the rotor"
 
 
-def _turning(log: FlightLog) -> Iterator[Row]:
+def _check_turn_direction(log: FlightLog) -> Iterator[Row]:
     """Which way the vehicle turns when motors differ: order of the motors, and sign."""
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), "")
     motors = log.samples(name)
     rate = log.samples("rate_b")
-    if motors is None or not usable(rate, MOVES) or log[name].values.shape[1:] != (4,):
+    if motors is None or not is_usable(rate, MOVES) or log[name].values.shape[1:] != (4,):
         return
     time_d, turning = rate.derivative(0.03)
     front_left, front_right, rear_left, rear_right = motors.values.T

@@ -111,7 +111,7 @@ READERS = {
 """Ending -> reader of the messages, and the kind of log."""
 
 
-def converted_logs(files: Iterable[Path]) -> list[Path]:
+def choose_converted_tables(files: Iterable[Path]) -> list[Path]:
     """Return one table of each PX4 log among tables, which ``ulog2csv`` wrote."""
     topics = {tap.message for tap in fields_of_autopilots()["taps"]["ulog"]}
     logs: dict[str, Path] = {}
@@ -149,7 +149,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
         raise LogError(
             f"{path}: no message about a vehicle's motion; known: {', '.join(sorted(tapped))}"
         )
-    if (flying := _flying(log)) is not None:
+    if (flying := _find_flying(log)) is not None:
         channels["flying"] = flying
     starts = [float(channel.time[0]) for channel in channels.values() if len(channel.time)]
     if not starts or not math.isfinite(min(starts)):
@@ -175,12 +175,12 @@ def _channel(
             )
         return None
     entry = tap.entry(vehicle)
-    chosen = _moving(log.instances(tap.message), entry.columns, tap)
+    chosen = _choose_moving(log.instances(tap.message), entry.columns, tap)
     if chosen is None:
         return None
     number, fields = chosen
     if tap.message in MOTORS_ALONE:
-        count = _moving_motors(fields, fields_of_motors)
+        count = _count_moving_motors(fields, fields_of_motors)
         if count > len(entry.columns):
             left_out.append(f"{tap.message}: {count} motors move, not the four of a quadrotor")
             return None
@@ -200,7 +200,7 @@ def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Cha
         values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
     if entry.name == "vel_w" and "velocity_frame" in fields:
         values = _to_world(values, fields)
-    return make_channel(fields["time"], values, entry, source, ~valid_rows(fields, tap.good))
+    return make_channel(fields["time"], values, entry, source, ~find_valid_rows(fields, tap.good))
 
 
 def log_of_poses(path: str | Path, kind: str, message: str, instance: int) -> FlightLog:
@@ -217,7 +217,7 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int) -> Fl
     taps = _pose_taps(kind)
     log = READERS[f".{kind}"][0](path, {tap.message for tap in taps} | {"ORGN"})
     if message not in log.names:
-        raise _missing(message, kind, log)
+        raise _make_missing_error(message, kind, log)
     data = log.fields.get((message, instance))
     if data is None:
         return FlightLog({})
@@ -239,7 +239,7 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int) -> Fl
     return FlightLog(channels, {"source": str(path), "together": together})
 
 
-def _missing(message: str, kind: str, log: Messages) -> LogError:
+def _make_missing_error(message: str, kind: str, log: Messages) -> LogError:
     available = ", ".join(name for name in pose_messages(kind) if name in log.names)
     return LogError(
         f"{log.path}: no {message} in this log; of the messages with poses it has:"
@@ -313,23 +313,23 @@ def _to_local(data: Fields, origins: Fields | None) -> Fields:
     }
 
 
-def valid_rows(fields: Fields, flags: str) -> ndarray:
+def find_valid_rows(fields: Fields, flags: str) -> ndarray:
     """Tell the rows that those of these flags that a message has call valid, bool, shape (T,)."""
     good = np.ones(len(fields["time"]), bool)
     ranges = fields_of_autopilots()["ranges"]
     for flag in flags.split():
         if flag in fields:
-            good &= in_range(fields[flag], *ranges.get(flag, (1.0, math.inf)))
+            good &= lies_within(fields[flag], *ranges.get(flag, (1.0, math.inf)))
     return good
 
 
-def in_range(values: ndarray, smallest: float, largest: float) -> ndarray:
+def lies_within(values: ndarray, smallest: float, largest: float) -> ndarray:
     """Tell the values within bounds, bool, shape (T,)."""
     numbers = np.asarray(values, float)
     return (numbers >= smallest) & (numbers <= largest)
 
 
-def _moving(
+def _choose_moving(
     instances: dict[int, Fields], columns: tuple[str, ...], tap: Tap
 ) -> tuple[int, Fields] | None:
     """Return the first instance of a message with these columns that moves, else the first."""
@@ -339,7 +339,7 @@ def _moving(
             rows = np.ones(len(fields["time"]), bool)
             if tap.only is not None:
                 name, *bounds = tap.only
-                rows = in_range(fields[name], *bounds)
+                rows = lies_within(fields[name], *bounds)
             if np.any(rows):
                 candidates.append((number, {name: values[rows] for name, values in fields.items()}))
     moving = [
@@ -359,13 +359,13 @@ def _list_untaken(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
         if fields is None:
             continue
         name = ranges[0][0]
-        if not any(np.any(in_range(fields[name], *bounds)) for _, *bounds in ranges):
+        if not any(np.any(lies_within(fields[name], *bounds)) for _, *bounds in ranges):
             received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
             accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in ranges)
             yield f"{message}: its {name} is {received}; those that are read: {accepted}"
 
 
-def _moving_motors(fields: Fields, pattern: str) -> int:
+def _count_moving_motors(fields: Fields, pattern: str) -> int:
     """Count the motors of a message that move, named by a pattern such as ``control[*]``."""
     names = [pattern.replace("*", str(number)) for number in range(16)]
     return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
@@ -384,14 +384,14 @@ def _join_escs(log: Messages) -> None:
     log.fields["ESC", min(escs)] = {"time": time, **speeds}
 
 
-def _flying(log: Messages) -> Channel | None:
+def _find_flying(log: Messages) -> Channel | None:
     """Whether the vehicle is armed and in the air; None where the log does not say."""
     signals = []
     for message, field, *bounds in fields_of_autopilots()["flying"][log.kind]:
         fields = log.first(message)
         if fields is not None and field in fields:
             order = np.argsort(fields["time"], kind="stable")
-            signals.append((fields["time"][order], in_range(fields[field], *bounds)[order]))
+            signals.append((fields["time"][order], lies_within(fields[field], *bounds)[order]))
     if not signals:
         return None
     time = np.unique(np.concatenate([time for time, _ in signals]))

@@ -78,19 +78,19 @@ def read_ulog(path: str | Path, names: Collection[str]) -> Messages:
     Raises LogError: pyulog is not installed, or the file is no ULog.
     """
     ulog = load_extra("pyulog", "logs", f"{path}: a PX4 log", LogError)
-    with _parsing(path, "a PX4 log (.ulg)"):
+    with _report_parser_errors(path, "a PX4 log (.ulg)"):
         log = ulog.ULog(Forward(Path(path).read_bytes()), list(names))
     messages = Messages(Path(path), "ulog")
     for data in log.data_list:
         if "timestamp" in data.data:
-            messages.fields[data.name, data.multi_id] = _stamped(data.data)
+            messages.fields[data.name, data.multi_id] = _add_times(data.data)
     drops = [(drop.timestamp * 1e-6, drop.duration * 1e-3) for drop in log.dropouts]
     messages.meta = {"dropouts": drops, "damaged": bool(log.file_corruption)}
     messages.parameters = {str(name): float(x) for name, x in log.initial_parameters.items()}
     return messages
 
 
-def _stamped(data: Fields) -> Fields:
+def _add_times(data: Fields) -> Fields:
     """Add when a topic of PX4 was measured and when it was written to its fields."""
     arrival = data["timestamp"] * 1e-6
     sample = data.get("timestamp_sample")
@@ -115,7 +115,7 @@ def read_converted(path: str | Path, names: Collection[str]) -> Messages:
             data = read_table(file)
             if "timestamp" not in data:
                 raise LogError(f"{file}: no column 'timestamp'; expected a table of ulog2csv")
-            messages.fields[topic, instance] = _stamped(data)
+            messages.fields[topic, instance] = _add_times(data)
     return messages
 
 
@@ -141,7 +141,7 @@ def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
     columns = _Columns()
     firmware = ""
     nan = math.nan
-    with _parsing(path, "an ArduPilot dataflash log (.BIN)") as complaints:
+    with _report_parser_errors(path, "an ArduPilot dataflash log (.BIN)") as complaints:
         with Path(path).open("rb") as file:
             head = file.read(2)
         if head != _HEAD:
@@ -334,7 +334,7 @@ class Forward(io.BytesIO):
 
 
 @contextmanager
-def _parsing(path: str | Path, what: str) -> Iterator[list[str]]:
+def _report_parser_errors(path: str | Path, what: str) -> Iterator[list[str]]:
     """Turn whatever a parser makes of a file that is none of its own into one error; what it prints
     becomes a list.
 

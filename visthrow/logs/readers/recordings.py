@@ -155,7 +155,7 @@ def _matlab(path: Path) -> Table:
 
     try:
         require_room(path, sum(8 * math.prod(shape) for _, shape, _ in whosmat(path)), LogError)
-        return _flat(loadmat(path, simplify_cells=True))
+        return _flatten(loadmat(path, simplify_cells=True))
     except NotImplementedError:  # version 7.3 is HDF5
         return _hdf5(path)
     except TypeError as error:
@@ -176,10 +176,10 @@ def _hdf5(path: Path) -> Table:
     with h5py.File(path) as file:
         file.visititems(note)
         require_room(path, sum(item.nbytes for item in arrays.values()), LogError)
-        return _flat({name: item[()] for name, item in arrays.items()})
+        return _flatten({name: item[()] for name, item in arrays.items()})
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
+def _flatten(tree: dict[str, Any], prefix: str = "") -> Table:
     """Columns of a tree of arrays: vectors as they are, matrices column by column, the longer side
     being time.
     """
@@ -188,15 +188,15 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Table:
         if name.startswith("__"):
             continue
         if isinstance(value, dict):
-            table |= _flat(value, f"{prefix}{name}.")
+            table |= _flatten(value, f"{prefix}{name}.")
             continue
         values = np.asarray(value)
         if values.dtype.names:
-            table |= _flat(
+            table |= _flatten(
                 {field: values[field] for field in values.dtype.names}, f"{prefix}{name}."
             )
         elif values.dtype.kind == "O" and values.size <= WIDEST:  # a cell, or several structs
-            table |= _flat({f"{name}[{i}]": _open(x) for i, x in enumerate(values.flat)}, prefix)
+            table |= _flatten({f"{name}[{i}]": _open(x) for i, x in enumerate(values.flat)}, prefix)
         elif values.dtype.kind in "biuf":
             values = values.squeeze()
             values = values.T if values.ndim == 2 and values.shape[0] < values.shape[1] else values

@@ -313,7 +313,7 @@ def make_channel(
     time = time[rows[~blank]]
     values = values[rows[~blank]]
     valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
-    valid &= ~lost_rows(values)
+    valid &= ~find_lost_rows(values)
     if bad is not None:
         valid &= ~bad[rows[~blank]]
         notes["invalid by the source"] = int(np.sum(bad[rows[~blank]]))
@@ -370,7 +370,7 @@ def forward_rows(stamps: np.ndarray) -> np.ndarray:
     return rows[earlier if np.sum(earlier) > np.sum(later) else later]
 
 
-def lost_rows(values: np.ndarray) -> np.ndarray:
+def find_lost_rows(values: np.ndarray) -> np.ndarray:
     """Tell rows of three or more columns that are all zero where the body jumps to and from them:
     a capture's word for a body that it does not see. Shape (T, C); returns bool, shape (T,).
     """

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         args.throws = min(args.throws, 2)
         args.plants = []
     by_target = list(_list_units(args, bounds))
-    swept = [] if args.no_sweep else list(_swept(args, bounds))
+    swept = [] if args.no_sweep else list(_list_sweep_units(args, bounds))
     flights = thrower.fly_units(by_target + swept, out / "throws", status)
     rows = flights[: len(by_target)]
     front = flights[len(by_target) :]
@@ -102,7 +102,7 @@ def _list_units(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str
             )
 
 
-def _swept(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
+def _list_sweep_units(args: argparse.Namespace, bounds: str) -> Iterator[list[dict[str, Any]]]:
     """Yield the units of each setting of the sweep: in the MPC's model, and on the plants with all
     delays compensated.
     """

@@ -163,7 +163,7 @@ def training_section(thrown: ResultSet) -> Section:
             "Landing error of the training's own throws, random starts and goals, over environment"
             " steps; a colour a seed."
         )
-        picture = Picture("learning", charts.learning(list(groups.items())), text)
+        picture = Picture("learning", charts.draw_learning(list(groups.items())), text)
     header = (
         "run | seed | million steps | pieces | time [s] | final error [m] | final duration [s]"
         " | device | commit"

@@ -199,7 +199,7 @@ def _curve(axis, line: Line):
     return curve_line
 
 
-def learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
+def draw_learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
     """Draw landing errors during training with one panel for each group; return a PNG. A run has
     two rows: environment steps (N,) and errors (N,).
     """

@@ -371,10 +371,13 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
     rows = []
     for v, w_t, rho, e, d, p, u in PAPER_FRONT:
         figures_of_row = (f"{e:.3f}", f"{d:.3f}", f"{100 * p:.1f}", f"{100 * u:.1f}")
-        rows.append((*_setting(v, w_t, rho), "the paper's", *figures_of_row))
+        rows.append((*_describe_setting(v, w_t, rho), "the paper's", *figures_of_row))
     for r in sorted(selected, key=lambda r: (r.unit["bounds"], r.unit["speed"], -r.unit["w_t"])):
         unit = r.unit
-        head = (*_setting(unit["speed"], unit["w_t"], unit["rho"]), f"bounds on {unit['bounds']}")
+        head = (
+            *_describe_setting(unit["speed"], unit["w_t"], unit["rho"]),
+            f"bounds on {unit['bounds']}",
+        )
         if r.good.all():
             row = _row(r)
             names = ("landing error [m]", "duration [s]", "e_p [cm]", "e_v [cm/s]")
@@ -386,5 +389,5 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
     return Grid.from_rows(title, header, rows, heads=0)
 
 
-def _setting(speed: float, w_t: float, rho: float) -> tuple[str, str, str]:
+def _describe_setting(speed: float, w_t: float, rho: float) -> tuple[str, str, str]:
     return f"{speed:g}", f"{w_t / 1e3:g}k", f"{rho:g}"

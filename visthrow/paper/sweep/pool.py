@@ -105,7 +105,7 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
     """
 
     def is_remaining(unit: ResultSource | ThrowUnit) -> bool:
-        if unit.id not in done and unit.done(out):
+        if unit.id not in done and unit.is_done(out):
             done.add(unit.id)
         return unit.id not in done
 

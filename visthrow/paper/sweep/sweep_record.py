@@ -32,10 +32,10 @@ def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
     width = max(len(source.name) for source in work.sources)
     for source in work.sources:
         units = work.throws.get(source.id, ())
-        thrown = sum(unit.done(out) for unit in units)
+        thrown = sum(unit.is_done(out) for unit in units)
         state, spent = _state(source, out)
         seconds += spent
-        remaining += (not source.done(out)) + len(units) - thrown
+        remaining += (not source.is_done(out)) + len(units) - thrown
         lines.append(f"{source.name:{width}}  {state:44}  throws {thrown}/{len(units)}")
     lines.append(
         f"{len(work.sources)} runs, {seconds / 60:.1f} minutes of training, {remaining} units left"
@@ -48,9 +48,9 @@ def _state(source: ResultSource, out: Path) -> tuple[str, float]:
     if not source.config:
         return "there already", 0.0
     rows = _progress(source, out)
-    seconds = sum(_spent(rows)[-1:])
+    seconds = sum(_sum_seconds(rows)[-1:])
     count = f"{len(rows)} of {source.iterations} iterations"
-    if source.done(out):
+    if source.is_done(out):
         error = _final(source, out)["error_mean"]
         place = "" if error is None else f", {error:.3f} m at 2.0 m"
         return f"done in {seconds:.0f} s{place}", seconds
@@ -69,7 +69,7 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
     throws = records / "throws" / f"{work.name}.json"
     runs = _runs(work, out, training)
     units = chain.from_iterable(work.throws.values())
-    thrown = [unit for unit in units if unit.done(out)]
+    thrown = [unit for unit in units if unit.is_done(out)]
     if not runs and not thrown and not throws.exists():
         raise StorageError(
             f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep"
@@ -88,7 +88,7 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
 def _runs(work: SweepWork, out: Path, record: Path) -> dict[str, dict[str, Any]]:
     """Return the finished trainings of a record and of a folder by name."""
     runs = {run["name"]: run for run in runs_of(record)} if record.exists() else {}
-    trained = [source for source in work.sources if source.config and source.done(out)]
+    trained = [source for source in work.sources if source.config and source.is_done(out)]
     return runs | {source.name: _run(source, out) for source in trained}
 
 
@@ -104,7 +104,7 @@ def _progress(source: ResultSource, out: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row.get("wall_s")]
 
 
-def _spent(rows: list[dict[str, str]]) -> list[float]:
+def _sum_seconds(rows: list[dict[str, str]]) -> list[float]:
     """Return the duration of work up to the end of each iteration [s]."""
     return list(accumulate(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows))
 
@@ -129,7 +129,7 @@ def _run(source: ResultSource, out: Path) -> dict[str, Any]:
     experiment = source.experiment()
     per_iteration = experiment.samples
     step = max(len(rows) // CURVE_POINTS, 1)
-    spent = _spent(rows)
+    spent = _sum_seconds(rows)
     curve = []
     for i in range(step - 1, len(rows), step):
         steps = int(rows[i]["iteration"]) * per_iteration

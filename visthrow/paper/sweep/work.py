@@ -86,11 +86,11 @@ def work(work: SweepWork, out: Path, ids: Sequence[str], device: str, minutes: f
         unit = throws.get(name) or work.source(name)
         try:
             with hold_lock(lock_of(out, name)):
-                if unit.done(out):
+                if unit.is_done(out):
                     continue
                 if isinstance(unit, ResultSource):
                     status = train(unit, out, device, remaining, work.checkpoint_every)
-                elif unit.source.done(out):
+                elif unit.source.is_done(out):
                     fly(unit, out, device)
         except BusyError as error:
             print(error, file=sys.stderr)
@@ -133,7 +133,7 @@ def train(
     status = 1
     try:
         status = session.run(args)
-        status = status if status or source.done(out) else EXIT_STOPPED  # stopped by the time limit
+        status = status if status or source.is_done(out) else EXIT_STOPPED  # stopped by the time limit
     finally:
         piece = {
             "start": began,

@@ -58,7 +58,7 @@ class ResultSource:
         """Return the policy's path, whether the file exists or not."""
         return self.folder(out) / POLICY if self.config else find_policy(self.name)
 
-    def done(self, out: Path) -> bool:
+    def is_done(self, out: Path) -> bool:
         """Return whether the policy exists and, for a training, its summary."""
         return not self.config or (self.folder(out) / SUMMARY).is_file()
 
@@ -138,10 +138,10 @@ class ThrowUnit:
             return FULL[layout], self.params.changes
         return self.source.config, self.source.flown + self.params.changes
 
-    def done(self, out: Path) -> bool:
+    def is_done(self, out: Path) -> bool:
         """Return whether the result exists."""
         return (
-            self.source.done(out)
+            self.source.is_done(out)
             and (throws_folder(out) / f"{results.key_of(self.unit(out))}.json").is_file()
         )
 

@@ -14,7 +14,7 @@ from camera.keypoint_noise import DetectorView
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import RopeParams
 from sim.torch_bridge import TorchViews, on_torch_stream
-from visthrow.common.compute_device import rounded_products
+from visthrow.common.compute_device import allow_rounded_products
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
@@ -244,7 +244,7 @@ class ThrowEnv(ThrowEpisodes):
         parts = [self.view, self.delay, self.goals]
         return [part for part in parts if part is not None]
 
-    @rounded_products(False)
+    @allow_rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Return the actor's and the critic's observations of the current state."""
         state = self.views.state

@@ -29,7 +29,7 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
     without_each,
 )
 from visthrow.logs.flightlog import FlightLog
-from visthrow.logs.samples import Samples, on_grid
+from visthrow.logs.samples import Samples, interpolate
 
 ROWS = 2  # of commands and attitudes a step
 SWINGING = 3  # steps a row where a payload swings below
@@ -209,7 +209,7 @@ class FlyerModel(DrivenModel):
         measured = self.of_windows(lanes, "turned")
         rows = np.arange(measured.shape[1])
         imposed = rows[: self.rows + 1]
-        shown = [on_grid(rows, table, begin + imposed) for table, begin in zip(measured, late)]
+        shown = [interpolate(rows, table, begin + imposed) for table, begin in zip(measured, late)]
         quat, rate, lean = np.split(np.array(shown), [4, 7], axis=2)
         quat /= np.linalg.norm(quat, axis=2, keepdims=True)
         turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")[:, None]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray
 
 from sim.effects.setting import AERODYNAMICS
-from sim.params import LawParams, PlantParams, RopeParams, SensingParams, changed
+from sim.params import LawParams, PlantParams, RopeParams, SensingParams, change_values
 from visthrow.common.errors import LogError
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
@@ -72,7 +72,7 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...]) -> PlantParams:
         joint_damping=0.0,
         mount=cable.mount,
     )
-    return PlantParams(changed(base.vehicle, values), rope, base.release, base.sim, laws=laws)
+    return PlantParams(change_values(base.vehicle, values), rope, base.release, base.sim, laws=laws)
 
 
 @cache
@@ -110,7 +110,7 @@ def replay_of(
         inertia[:, 2] *= 1.0 + sizes["inertia_z"]
     rope = rows["ropes"]
     rope["last_inertia"] = rope["last_mass"] * rope["last_center"] ** 2
-    return replay.of_rows(rows)
+    return replay.with_rows(rows)
 
 
 def _number(rows: Mapping[str, ndarray], path: str) -> ndarray:

@@ -18,7 +18,7 @@ from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, Tor
 from visthrow.diagnose.models.quadrotor.flyer_windows import cut_flying
 from visthrow.logs.check.relations import Relation, relate
 from visthrow.logs.flightlog import FlightLog
-from visthrow.logs.samples import Samples, on_grid
+from visthrow.logs.samples import Samples, interpolate
 
 CHANNELS = ("acc_b", "rate_b")
 COLUMNS = slice(3, 4), slice(0, 3)  # of the state that these channels show
@@ -99,7 +99,7 @@ class ImuModel(DrivenModel):
         for channel in range(len(self.channels)):
             states = path[..., COLUMNS[channel]]
             time = stretch.time[stretch.channel == channel][:: states.shape[2]]
-            measured.append(np.array([on_grid(grid, lane, time).ravel() for lane in states]))
+            measured.append(np.array([interpolate(grid, lane, time).ravel() for lane in states]))
         return np.concatenate(measured, axis=1)
 
     def _turn(self, lanes: Lanes, thrust: ndarray, push: ndarray) -> ndarray:

@@ -89,7 +89,7 @@ def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     meta["start"] = float(time[0]) if len(time) else 0.0
     meta["ingest"] = {}
     channels: dict[str, Channel] = {}
-    for entry in [*_sensor_channels(header), *_driven(table, header)]:
+    for entry in [*_sensor_channels(header), *_map_motors(table, header)]:
         if table.keys() >= set(entry.columns):
             values = np.column_stack([table[column] for column in entry.columns])
             channel, notes = make_channel(time - meta["start"], values, entry, meta["source"])
@@ -110,7 +110,7 @@ def _sensor_channels(header: dict[str, str]) -> list[ChannelMap]:
     return [ChannelMap(**row | {"columns": tuple(row["columns"])}) for row in rows]
 
 
-def _driven(table: Table, header: dict[str, str]) -> list[ChannelMap]:
+def _map_motors(table: Table, header: dict[str, str]) -> list[ChannelMap]:
     """Return the channels of motors."""
     low, high = (float(x) for x in header.get("motorOutput", _MOTOR_OUTPUT).split(","))
     span = (high - low) or 1.0
