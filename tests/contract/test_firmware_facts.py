@@ -133,7 +133,7 @@ SAYINGS = [
     ("betaflight", r"pilot's sticks after ([\d.]+) s", "override_window"),
     ("crazyflie", r"levels after ([\d.]+) s", "levels_after"),
     ("crazyflie", r"lock after ([\d.]+) s", "stops_after"),
-    ("crazyflie", r"own controller over (\d+)", "manual_thrust"),
+    ("crazyflie", r"controller divided by (\d+)", "manual_thrust"),
     ("faults", r"Since: the pilot's sticks after ([\d.]+) s", "override_window"),
 ]
 """Page, words with a number, and the row that has the number."""
