@@ -74,7 +74,7 @@ class SourceParams:
 
     def __post_init__(self) -> None:
         if bool(self.columns) != (self.time is not None):
-            raise ConfigError("source: columns of a table need its time, and a time its columns")
+            raise ConfigError("source: a table needs both a time and columns")
 
     @property
     def mapping(self) -> TableMap | None:

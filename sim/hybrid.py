@@ -409,7 +409,7 @@ class HybridSim:
 
         Raises ValueError: another shape, or a simulator built without the extension "push"."""
         if "push" not in self.extensions:
-            raise ValueError("a wrench from outside; expected a simulator with extension 'push'")
+            raise ValueError("an external wrench; expected a simulator with extension 'push'")
         zero = np.zeros(3)
         wrench = {"force_w": (force_w, zero), "torque_b": (torque_b, zero)}
         st.put(self.types, self.state, wrench, self.count)

@@ -146,7 +146,7 @@ def _tree(path: str | Path) -> Any:
     try:
         text = Path(path).read_bytes().decode("utf-8-sig").replace("\r\n", "\n").strip()
     except UnicodeDecodeError as error:
-        raise ValueError(f"no text ({error}); expected a calibration file") from error
+        raise ValueError(f"not text ({error}); expected a calibration file") from error
     if text.startswith("<"):
         return _tree_of_xml(text)
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
@@ -164,7 +164,7 @@ def _tree_of_yaml(text: str) -> Any:
     try:
         documents = list(yaml.safe_load_all(text))
     except (yaml.YAMLError, ValueError) as error:
-        raise ValueError(f"is no complete YAML (cut short?): {error}") from error
+        raise ValueError(f"is not complete YAML (cut short?): {error}") from error
     return next((tree for tree in documents if isinstance(tree, dict | list)), None)
 
 
@@ -180,7 +180,7 @@ def _tree_of_xml(text: str) -> Any:
     try:
         return tree_of(ElementTree.fromstring(text))
     except ElementTree.ParseError as error:
-        raise ValueError(f"is no complete XML (cut short?): {error}") from error
+        raise ValueError(f"is not complete XML (cut short?): {error}") from error
 
 
 def _cameras_of(path: str | Path) -> list[Entry]:

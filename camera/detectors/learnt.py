@@ -140,7 +140,7 @@ class Networks(nn.Module):
                 networks.load_state_dict({n: torch.from_numpy(x) for n, x in numbers.items()})
         except (OSError, EOFError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
             raise ValueError(
-                f"{path}: no detector written by `visthrow detector train`: {error}"
+                f"{path}: not a detector written by `visthrow detector train`: {error}"
             ) from error
         networks.calibration = {kind: tuple(header["calibration"][kind]) for kind in KINDS}
         networks.made_by = header["made_by"]

@@ -117,7 +117,7 @@ class CflibPort(Port):
             raise LinkError(f"cannot open {address}: {error}") from error
         if self._open is None:
             raise LinkError(
-                f"cannot open {address}: no driver of cflib takes it; expected"
+                f"cannot open {address}: no driver of cflib accepts it; expected"
                 f" {', '.join(CFLIB)}..."
             )
 

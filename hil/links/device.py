@@ -67,8 +67,8 @@ def check_device(text: str, *, remote: bool = False) -> Device:
         raise LinkError(f"device {text!r}: port {port}; expected 1 to 65535")
     if not address.is_loopback and not remote:
         raise LinkError(
-            f"device {text!r} leaves this machine; set link.remote = true in the config where that"
-            " is what you want"
+            f"device {text!r} is on another machine; set link.remote = true in the config to allow"
+            " that"
         )
     return Device(match[1], host, port)
 

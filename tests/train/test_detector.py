@@ -44,7 +44,7 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
     assert (folder / "learnt.npz").stat().st_size < 500_000
     (folder / "checkpoint.pt").write_bytes(b"broken")
     assert train(folder, "--set", "steps=2", "--resume") == 2
-    assert "no checkpoint of this training" in capsys.readouterr().err
+    assert "not a checkpoint of this training" in capsys.readouterr().err
     assert train(tmp_path / "none", "--resume") == 2
     assert "no checkpoint to resume from" in capsys.readouterr().err
 

@@ -204,9 +204,9 @@ def _parse(
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name}: no valid TOML: {error}") from None
+        raise ConfigError(f"{name}: not valid TOML: {error}") from None
     except RecursionError:
-        raise ConfigError(f"{name}: no valid TOML: brackets are nested too deeply") from None
+        raise ConfigError(f"{name}: not valid TOML: brackets are nested too deeply") from None
     return _complete(schema, raw, name, folder, stack)
 
 

@@ -391,7 +391,7 @@ class Fit:
                 getattr(self, name).load_state_dict(saved[name])
             self.step = saved["step"]
         except Exception as error:  # torch raises various errors for other files
-            raise ValueError(f"{path}: no checkpoint of this training: {error}") from error
+            raise ValueError(f"{path}: not a checkpoint of this training: {error}") from error
 
     @torch.no_grad()
     def calibrate(self) -> dict[str, dict[str, float]]:

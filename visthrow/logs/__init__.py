@@ -196,8 +196,8 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
         parts = str(path).split("+")
         if len(parts) > 1 and Path(parts[0]).exists():
             raise LogError(
-                f"{path}: {len(parts)} files; expected one: a mapping is of one table. `check` and"
-                " `explain` join logs, and a folder of tables is one recording"
+                f"{path}: {len(parts)} files; expected one: a mapping describes one table. `check`"
+                " and `explain` join logs, and a folder of tables is one recording"
             )
         raise _make_missing_error(path)
     _refuse_pointer(path)

@@ -419,7 +419,7 @@ def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     for key, kind in schema.items():
         if not isinstance(header.get(key), kind):
             raise PolicyError(
-                f"no policy: header entry '{key}' is {header.get(key)!r}; expected a"
+                f"not a policy: header entry '{key}' is {header.get(key)!r}; expected a"
                 f" {kind.__name__}"
             )
     return {key: header[key] for key in schema}

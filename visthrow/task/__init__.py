@@ -559,8 +559,8 @@ def draw_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     values, vectors = np.linalg.eigh(covariance)
     if not np.allclose(covariance, covariance.T) or values.min() < -1e-9 * values.max():
         raise ConfigError(
-            "diagnosed.covariance is no covariance: it is not symmetric, or has a negative"
-            " eigenvalue"
+            "diagnosed.covariance is not a covariance matrix: it is not symmetric, or has a"
+            " negative eigenvalue"
         )
     normal = np.random.default_rng(seed).standard_normal((diagnosed.plants, len(diagnosed.effects)))
     base = generalise(Setting(plant, experiment.sensing))

@@ -71,7 +71,7 @@ def load_policy(
         whole = dict.fromkeys(key.split("[")[0] for key in error.keys)
         allowing = " ".join(f"--allow {key}" for key in whole)
         raise MismatchError(
-            f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
+            f"{error}\nto throw anyway (fly and compare accept it): {allowing}", error.keys
         ) from None
     if experiment.fleet is not None:  # fly one vehicle, that of the config
         policy, experiment = specialise(policy, change_values(experiment, {"fleet.count": 0}))
@@ -123,7 +123,7 @@ def training_experiment(
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         raise PolicyError(
-            f"{path} does not carry the config it was trained with; name one with --config"
+            f"{path} does not hold the configuration it was trained with; name one with --config"
         )
     # Learning parameters are the current ones: they do not affect flight, and an older policy may
     # lack some of them.

@@ -110,7 +110,7 @@ class Distillation(Algorithm):
         self.p = p = experiment.distillation
         if experiment.task.target.moves or experiment.task.observation.layout != "vision":
             raise ConfigError(
-                'algorithm = "distillation" takes goals that stand still and observation.layout ='
+                'algorithm = "distillation" needs stationary goals and observation.layout ='
                 ' "vision"'
             )
         self._ranks = ranks

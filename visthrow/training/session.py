@@ -94,7 +94,7 @@ def _check(args: Namespace) -> None:
     if args.resume and args.start:
         raise TrainError("--resume goes on with its own policy; --from starts a new run")
     if args.resume and not args.out and not args.config:
-        raise TrainError("--resume: of which run? name its folder with --out")
+        raise TrainError("--resume: name the run's folder with --out")
     if not args.resume and not args.config:
         raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
 
@@ -123,7 +123,7 @@ def _resume(args: Namespace, path: Path | None, folder: Path) -> tuple:
     experiment = config.load(Experiment, folder / "config.toml")
     if config.load(Experiment, folder / "config.toml", args.overrides) != experiment:
         raise CheckpointError(
-            f"{folder}: a run of another configuration than --set says; resume without it, or begin"
+            f"{folder}: the run's configuration is not that of --set; resume without it, or begin"
             " a new run"
         )
     if (

@@ -46,7 +46,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     writing = load_extra("mcap.writer", "recordings", f"{path}: an MCAP file", LogError)
     stamps = [channel.time[0] for channel in log.channels.values() if len(channel.time)]
     if not stamps:
-        raise LogError(f"{path}: a flight log without a sample; expected one at least")
+        raise LogError(f"{path}: a flight log without samples; expected at least one")
     begin = min(stamps)
     stream = io.BytesIO()
     writer = writing.Writer(stream)

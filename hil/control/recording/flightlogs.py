@@ -82,7 +82,7 @@ def date_by_arrival(sample: Sample, params: HilParams) -> float:
 
 
 def read(folder: str | Path) -> PlayedRun:
-    """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
+    """Play a run back; raises `RunError` for what is not the folder of a run, or a damaged one."""
     folder = Path(folder)
     params, policy, lines = load_run(folder)
     if not lines:

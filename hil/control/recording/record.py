@@ -146,9 +146,9 @@ def restore_poses(line: dict[str, Any]) -> dict[str, Any]:
 
 
 def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
-    """Raise `RunError` for what is no folder of a run, with what was expected in it."""
+    """Raise `RunError` for what is not the folder of a run, with what was expected in it."""
     if not is_run(folder, parts):
-        raise RunError(f"{folder}: no folder of a run; {EXPECTED}")
+        raise RunError(f"{folder}: not the folder of a run; {EXPECTED}")
 
 
 def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
@@ -181,7 +181,7 @@ def _replayable(path: Path) -> dict[str, Any]:
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:
-    """Return config, policy and ticks of a run; raises `RunError` for no folder of a run, or a
+    """Return config, policy and ticks of a run; raises `RunError` for what is no run, or a
     damaged one.
     """
     folder = Path(folder)
@@ -273,5 +273,5 @@ def open_folder(path: str | Path) -> Iterator[Path]:
             ) from error
         if not is_run(Path(folder)):
             names = ", ".join(entry.filename for entry in entries) or "nothing"
-            raise RunError(f"{path}: no bundle of a run, it holds {names}; {EXPECTED}")
+            raise RunError(f"{path}: not the bundle of a run, it holds {names}; {EXPECTED}")
         yield Path(folder)

@@ -46,8 +46,7 @@ class ArduPilotParams(AutopilotParams):
             )
         if self.release == "servo" and not self.servo_output:
             raise ConfigError(
-                "release 'servo' with servo_output 0; expected the output that the mechanism"
-                " hangs on"
+                "release 'servo' with servo_output 0; expected the output that drives the mechanism"
             )
 
 

@@ -239,14 +239,14 @@ def _folder(path: Path) -> tuple[Callable[[int], ndarray], list[float]]:
     rows = _stamps(path / STAMPS, ("file", "time_s"))
     missing = [name for name, _ in rows if not (path / name).is_file()]
     if missing:
-        raise SourceError(f"{path / STAMPS} names {missing[0]}, which is not there")
+        raise SourceError(f"{path / STAMPS} names {missing[0]}, which does not exist")
 
     def read(index: int) -> ndarray:
         import cv2
 
         picture = cv2.imread(str(path / rows[index][0]), cv2.IMREAD_COLOR)
         if picture is None:
-            raise SourceError(f"{path / rows[index][0]}: no picture that OpenCV can read")
+            raise SourceError(f"{path / rows[index][0]}: not a picture that OpenCV can read")
         return picture
 
     return read, [time for _, time in rows]
@@ -260,7 +260,7 @@ def _video(path: Path) -> tuple[Callable[[int], ndarray], list[float]]:
 
     video = cv2.VideoCapture(str(path))
     if not path.is_file() or not video.isOpened():
-        raise SourceError(f"{path}: no video that OpenCV can open")
+        raise SourceError(f"{path}: not a video that OpenCV can open")
     stamps = path.with_suffix(f".{STAMPS}")
     if stamps.is_file():
         times = [time for _, time in _stamps(stamps, ("frame", "time_s"))]
@@ -268,7 +268,7 @@ def _video(path: Path) -> tuple[Callable[[int], ndarray], list[float]]:
         rate = video.get(cv2.CAP_PROP_FPS)
         if not rate > 0.0:
             raise SourceError(
-                f"{path}: the video names no rate; expected one, or {stamps.name} beside it"
+                f"{path}: the video states no frame rate; expected one, or {stamps.name} beside it"
             )
         times = [i / rate for i in range(int(video.get(cv2.CAP_PROP_FRAME_COUNT)))]
     position = -1

@@ -111,7 +111,7 @@ class Firmware:
         if not read_answer(self.stands, START):
             self.stop()
             raise RunError(
-                f"the firmware does not come to stand {START:g} s after its start; its words:"
+                f"the firmware does not stand still {START:g} s after its start; its output:"
                 f" {words!r}"
             )
 
@@ -262,7 +262,7 @@ class CommandLine:
             if not chunk:
                 raise RunError(
                     "the firmware's command line does not answer;"
-                    f" last words {data[-LAST_WORDS:]!r}"
+                    f" last output {data[-LAST_WORDS:]!r}"
                 )
             data += chunk
         return data.decode("ascii", "replace")

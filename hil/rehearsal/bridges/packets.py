@@ -120,7 +120,7 @@ class Sensors:
         answer = read_answer(self._stands, PATIENCE)
         if not answer:
             raise RunError(
-                f"the firmware has not come to the time {self._stamp:.3f} s of its samples after"
+                f"the firmware did not reach the time {self._stamp:.3f} s of its samples within"
                 f" {PATIENCE:g} s"
             )
         return np.frombuffer(answer, np.float32, offset=TIME).reshape(-1, MOTORS)[:, OURS]

@@ -151,7 +151,7 @@ def test_basalt_refusals(tmp_path):
         files.read(BASALT / "euroc_ds_calib.json", 2)
     path = tmp_path / "short.json"
     path.write_text((BASALT / "euroc_ds_calib.json").read_text()[:900])
-    with raises(ValueError, match=r"short\.json: is no complete YAML .cut short"):
+    with raises(ValueError, match=r"short\.json: is not complete YAML .cut short"):
         files.read(path)
     path.write_text(json.dumps([1, 2]))
     with raises(ValueError, match=r"holds no camera of a known tool"):

@@ -80,13 +80,13 @@ def test_networks_are_written_and_read(tmp_path):
     assert read.made_by == {"steps": 3}
     patch = torch.rand(2, 3, PATCH["goal"], PATCH["goal"])
     assert_close(read.goal(patch), made.goal(patch), atol=2e-3, rtol=0)
-    with raises(ValueError, match="no detector written by"):
+    with raises(ValueError, match="not a detector written by"):
         Networks.load(tmp_path / "none.npz")
     (tmp_path / "empty.npz").touch()
-    with raises(ValueError, match="no detector written by"):
+    with raises(ValueError, match="not a detector written by"):
         Networks.load(tmp_path / "empty.npz")
     (tmp_path / "b.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:2000])
-    with raises(ValueError, match="no detector written by"):
+    with raises(ValueError, match="not a detector written by"):
         Networks.load(tmp_path / "b.npz")
 
 

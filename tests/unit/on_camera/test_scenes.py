@@ -114,5 +114,5 @@ def test_photographs_that_are_none(tmp_path):
     with raises(ValueError, match="no photograph in"):
         photographs(tmp_path)
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with raises(ValueError, match="no picture that OpenCV can read"):
+    with raises(ValueError, match="not a picture that OpenCV can read"):
         pyramid(photographs(tmp_path))

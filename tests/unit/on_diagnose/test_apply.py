@@ -218,7 +218,7 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
         ({"theta": None}, "no diagnosis"),
         (
             {"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}},
-            "do not bear this out",
+            "do not confirm this",
         ),
         ({"model": "flyer"}, "a diagnosis of the model 'flyer'"),
         ({"theta": {"thrust_curve": -0.481}, "covariance": [[1e-3]]}, "from -0.0004 to 0.0004"),
@@ -294,7 +294,7 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
             "jugglebot",
             "ball_drag in 'N'; the ball's ball_drag is in '1/m'",
         ),
-        ({"thrust": 1.0}, "N", "jugglebot", "thrust are no effects of the ball"),
+        ({"thrust": 1.0}, "N", "jugglebot", "thrust are not effects of the ball"),
     ):
         report = diagnosis(
             **{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]}

@@ -237,7 +237,7 @@ def test_an_unknown_number_becomes_a_question(tmp_path):
     with raises(LogError, match=r"a\.ulg: describes its own contents"):
         table_of(tmp_path / "a.ulg")
     (tmp_path / "a.csv").write_text("t,x\n")
-    with raises(LogError, match="2 files; expected one: a mapping is of one table"):
+    with raises(LogError, match="2 files; expected one: a mapping describes one table"):
         table_of(f"{tmp_path}/a.csv+{tmp_path}/b.csv")
 
 

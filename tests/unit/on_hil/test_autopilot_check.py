@@ -85,7 +85,7 @@ def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
 def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
     shutil.copytree(run, tmp_path, dirs_exist_ok=True)
     (tmp_path / TICKS).unlink()
-    with raises(RunError, match="no folder of a run; expected"):
+    with raises(RunError, match="not the folder of a run; expected"):
         hover_of_run(tmp_path)
     (tmp_path / TICKS).write_text("")
     with raises(RunError, match="0 ticks of steady hover before throws; expected 50 or more"):

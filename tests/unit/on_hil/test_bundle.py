@@ -86,7 +86,7 @@ def test_what_is_no_bundle(tmp_path, refused):
         bundle.writestr("holiday.txt", "x")
     refused(
         f"hil replay {tmp_path}/other.zip",
-        message="other.zip: no bundle of a run, it holds holiday.txt; expected config.toml",
+        message="other.zip: not the bundle of a run, it holds holiday.txt; expected config.toml",
     )
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")

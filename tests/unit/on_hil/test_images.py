@@ -320,15 +320,15 @@ def test_wrong_pictures(folder, tmp_path):
     with raises(ConfigError, match=r"no table \[images\]"):
         load_run("dry_run", ["keypoints=detector"])
     (tmp_path / STAMPS).write_text("file,time_s\na.png,0.0\n")
-    with raises(SourceError, match=r"names a\.png, which is not there"):
+    with raises(SourceError, match=r"names a\.png, which does not exist"):
         RecordedImages(params(tmp_path), training())
     (tmp_path / "a.png").write_bytes(b"none")
-    with raises(SourceError, match="no picture that OpenCV can read"):
+    with raises(SourceError, match="not a picture that OpenCV can read"):
         RecordedImages(params(tmp_path), training()).poll(1.0)
     (tmp_path / STAMPS).write_text("file,time_s\na.png,1.0\na.png,0.5\n")
     with raises(SourceError, match="ascending"):
         RecordedImages(params(tmp_path), training())
-    with raises(SourceError, match="no video that OpenCV can open"):
+    with raises(SourceError, match="not a video that OpenCV can open"):
         RecordedImages(params(tmp_path / "a.mp4", kind="video"), training())
     assert cv2.imread(str(folder / "000.png")).shape == (280, 280, 3)
 

@@ -232,7 +232,7 @@ def test_natnet_that_does_not_answer():
 def test_wrong_names_hosts_and_missing_packages(monkeypatch):
     with raises(SourceError, match="expected each body once"):
         open_mocap(PARAMS, (BODIES[0], RigidBody("payload", "quad")), time.monotonic, False)
-    with raises(LinkError, match="leaves this machine; set link"):
+    with raises(LinkError, match="is on another machine; set link"):
         open_mocap(MocapParams("vicon", "192.168.1.9"), BODIES, time.monotonic, False)
     with raises(LinkError, match="refused"):
         open_mocap(MocapParams("vicon", "vicon.local"), BODIES, time.monotonic, True)

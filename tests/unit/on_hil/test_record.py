@@ -63,11 +63,11 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys, prin
 
 
 def test_what_is_no_run(run_folder, tmp_path, capsys):
-    with raises(RunError, match="no folder of a run; expected config"):
+    with raises(RunError, match="not the folder of a run; expected config"):
         load_run(tmp_path)
     for action in (["replay"], ["view"], ["check", "--hover-of"]):
         assert main(["hil", *action, str(tmp_path / "none")]) == 2
-        assert "no folder of a run" in capsys.readouterr().err
+        assert "not the folder of a run" in capsys.readouterr().err
     shutil.copytree(run_folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "ticks.jsonl").write_text('{"n": 0\n{"n": 1}\n')
     with raises(RunError, match="line 1 is damaged"):

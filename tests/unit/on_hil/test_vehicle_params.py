@@ -61,7 +61,7 @@ def test_wrong_configs(override, message):
 
 
 def test_a_servo_release_needs_its_output():
-    with raises(ConfigError, match="expected the output that the mechanism hangs on"):
+    with raises(ConfigError, match="expected the output that drives the mechanism"):
         load('ardupilot.release="servo"', "ardupilot.servo_output=0")
 
 
@@ -70,7 +70,7 @@ def test_a_servo_release_needs_its_output():
     [
         ("/bin/sh", LinkError, "is refused"),
         ("betaflight_SITL.elf", LinkError, "is refused"),
-        ("tcp:192.168.1.7:5761", LinkError, "leaves this machine"),
+        ("tcp:192.168.1.7:5761", LinkError, "is on another machine"),
         ("udp:127.0.0.1:5761", RunError, "MSP is a stream; expected tcp:... or serial:..."),
         ("tcp:127.0.0.1:9", LinkError, "cannot connect"),
     ],

@@ -178,7 +178,7 @@ def test_config_prints_what_loads_back(tmp_path, printed):
             "config vehicle paper --set body.mass=-1",
             "above 0 and at most 100000 (with body.mass=-1)",
         ),
-        ("config vehicle deep.toml", "deep.toml: no valid TOML: brackets are nested too"),
+        ("config vehicle deep.toml", "deep.toml: not valid TOML: brackets are nested too"),
         ("sweep status trial --out deep.toml", "deep.toml is a file; expected a"),
     ],
 )

@@ -86,7 +86,7 @@ def test_values_arrive_with_their_types(write):
         (("[1, 2.5]", "[-1, 0]"), ["inner", "gain[0] is -1.0; expected 0 or more"]),
         (("[1, 2.5]", "[1, 2]\n[mass2]"), ["mass2", "unknown key"]),
         (("count = 3", "count = {a = 1}"), ["count", "a table with the keys a", "a whole number"]),
-        (("count = 3", "count ="), ["no valid TOML"]),
+        (("count = 3", "count ="), ["not valid TOML"]),
     ],
 )
 def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, parts):

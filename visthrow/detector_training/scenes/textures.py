@@ -63,7 +63,7 @@ def pyramid(files: list[Path]) -> np.ndarray:
     for path in files:
         picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if picture is None:
-            raise ValueError(f"{path}: no picture that OpenCV can read")
+            raise ValueError(f"{path}: not a picture that OpenCV can read")
         side = min(picture.shape[:2])
         top = (picture.shape[0] - side) // 2
         margin = (picture.shape[1] - side) // 2

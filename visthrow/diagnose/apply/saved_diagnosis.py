@@ -52,7 +52,7 @@ class SavedDiagnosis:
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             reason = f"it has no {error}" if isinstance(error, KeyError) else error
             raise DiagnoseError(
-                f"{self.path}: no diagnosis that `visthrow diagnose explain` wrote: {reason}"
+                f"{self.path}: not a diagnosis that `visthrow diagnose explain` wrote: {reason}"
             ) from error
         count = len(theta)
         if covariance.size != count**2:
@@ -108,7 +108,7 @@ class SavedDiagnosis:
         strange = [name for name in theta if name not in effects]
         if strange:
             raise DiagnoseError(
-                f"{self.path}: {', '.join(strange)} are no effects of the {self.model};"
+                f"{self.path}: {', '.join(strange)} are not effects of the {self.model};"
                 f" {suggest(strange[0], effects)}"
             )
         findings = self.report.get("findings") or []
@@ -138,7 +138,7 @@ class SavedDiagnosis:
             reasons.append(f"log-likelihood {nats:+.3g} nats a sample")
         if reasons and self.report.get("theta"):
             raise DiagnoseError(
-                f"held-out flights do not bear this out: {'; '.join(reasons)}; --anyway writes it"
+                f"held-out flights do not confirm this: {'; '.join(reasons)}; --anyway writes it"
                 " all the same"
             )
 

@@ -77,8 +77,8 @@ def read_release(log: FlightLog) -> tuple[float, float]:
     when = log.meta.get("times", {}).get("separation")
     if when is None:
         raise ConfigError(
-            f"this flight let nothing go: {log.meta.get('result', {}).get('failure')}; expected a"
-            " throw"
+            f"this flight released no payload: {log.meta.get('result', {}).get('failure')};"
+            " expected a throw"
         )
     return float(log["payload_pos_w"].at(when)[2]), float(
         np.linalg.norm(log["payload_vel_w"].at(when))

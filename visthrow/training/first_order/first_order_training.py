@@ -58,9 +58,9 @@ def _require_supported(experiment: Experiment) -> None:
     unsupported = experiment.task.target.moves or experiment.fleet is not None
     if observation.layout != "state" or late or unsupported:
         raise ConfigError(
-            'algorithm = "first_order" takes observation.layout = "state", a latency of one period'
-            ' at most, one vehicle and goals that stand still; "distillation" makes a vision policy'
-            " of its policy"
+            'algorithm = "first_order" needs observation.layout = "state", a latency of one period'
+            ' at most, one vehicle and stationary goals; "distillation" makes a vision policy of its'
+            " policy"
         )
 
 
