@@ -59,8 +59,8 @@ def _require_supported(experiment: Experiment) -> None:
     if observation.layout != "state" or late or unsupported:
         raise ConfigError(
             'algorithm = "first_order" needs observation.layout = "state", a latency of one period'
-            ' at most, one vehicle and stationary goals; "distillation" makes a vision policy of its'
-            " policy"
+            ' at most, one vehicle and stationary goals; "distillation" makes a vision policy of'
+            " its policy"
         )
 
 
