@@ -17,13 +17,13 @@ from visthrow.paper.baseline.thrower import BOUNDS
 from visthrow.task.measurement import TARGETS
 
 
-def full() -> list[dict[str, Any]]:
+def list_units() -> list[dict[str, Any]]:
     """Units of the committed record ``baseline``: the cheap and informative ones first."""
     made_up = [*_list_front(), *_list_on_reference("both", 20, front.SPEEDS[1::2])]
     return [
         *_list_by_target(50),
         *made_up,
-        *_late_front(),
+        *_list_late_front(),
         *_list_on_reference("delay", 20, front.SPEEDS[1:2]),
     ]
 
@@ -56,7 +56,7 @@ def _list_front() -> Iterator[dict[str, Any]]:
             )
 
 
-def _late_front() -> Iterator[dict[str, Any]]:
+def _list_late_front() -> Iterator[dict[str, Any]]:
     """The sweep without compensation of the release's lag."""
     for how in _settings():
         yield from thrower.units("hybrid", "delay", FRONT_TARGET, FRONT_THROWS, **how)
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     path = Path(args.records) / "throws" / "baseline.json"
     known = results.load_all([path])
     units = results.work(
-        full(),
+        list_units(),
         args.out,
         thrower.fly_unit,
         known,

@@ -38,7 +38,7 @@ class Views:
         def uniform(*shape: int, low: float = -1.0, high: float = 1.0) -> torch.Tensor:
             return low + (high - low) * torch.rand(*shape, generator=draw)
 
-        def to(x: torch.Tensor) -> torch.Tensor:
+        def convert(x: torch.Tensor) -> torch.Tensor:
             return x.to(device=device, dtype=torch.float32)
 
         axis = torch.nn.functional.normalize(uniform(count, 3), dim=-1)
@@ -51,10 +51,10 @@ class Views:
         )
         pos_w = uniform(count, 3) * torch.tensor([0.5, 0.5, 0.5]) + torch.tensor([0.0, 0.0, 1.5])
         self.camera = KeypointCamera(params, device)
-        self.pos_w = to(pos_w)
-        self.rot_wb = to(torch.linalg.matrix_exp(angle * skew))
-        self.goal_w = to(uniform(count, 2) * 2.5)
-        self.payload_w = to(pos_w + 0.38 * rope)
+        self.pos_w = convert(pos_w)
+        self.rot_wb = convert(torch.linalg.matrix_exp(angle * skew))
+        self.goal_w = convert(uniform(count, 2) * 2.5)
+        self.payload_w = convert(pos_w + 0.38 * rope)
         corners = self.goal_w.new_zeros(count, 4, 3)
         corners[..., :2] = self.goal_w[:, None]
         around = torch.cat(

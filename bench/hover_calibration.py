@@ -41,7 +41,7 @@ PIXEL = 0.5 / 320.0
 GOAL = (2.0, 0.0, 0.0)
 
 
-def in_training(
+def calibrate_in_training(
     flown: Experiment, count: int, seed: int, device: str
 ) -> tuple[list, np.ndarray, np.ndarray]:
     """Calibrations, or None, in the training simulator; the drawn turns [rad] and errors of the
@@ -134,7 +134,9 @@ def main() -> None:
     flown = hover_start(load_experiment("vision_ideal", DRAWN))
     tilt_limit = TILT_DEG
     if args.plant == "hybrid":
-        calibrations, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
+        calibrations, turn, scale = calibrate_in_training(
+            flown, args.count, args.seed, resolve(args.device)
+        )
     else:
         calibrations, turn, scale = measure_on_reference(flown, args.plant, args.count, args.seed)
         tilt_limit = 0.5 * TILT_DEG

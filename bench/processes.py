@@ -153,12 +153,12 @@ class Pair:
         fake += ["--out", str(report), *self.fake]
         with contextlib.ExitStack() as both:
             if self.kind == "betaflight":
-                other = both.enter_context(self._started(fake, self.fake_core))
-                _first_line(other, "the fake")
-            runner = both.enter_context(self._started(run, self.core))
-            ready_line = _first_line(runner, "ready after")
+                other = both.enter_context(self._start(fake, self.fake_core))
+                _read_first_line(other, "the fake")
+            runner = both.enter_context(self._start(run, self.core))
+            ready_line = _read_first_line(runner, "ready after")
             if self.kind != "betaflight":
-                other = both.enter_context(self._started(fake, self.fake_core))
+                other = both.enter_context(self._start(fake, self.fake_core))
             interrupted = self._until(other, watch, runner, alone)
             killed = _end(runner, ready_line, alone)
         try:
@@ -183,7 +183,7 @@ class Pair:
     ) -> bool:
         """Wait for the fake's end; returns whether Ctrl-C caused it."""
         try:
-            _until(fake, watch, runner, alone)
+            _wait_for_end(fake, watch, runner, alone)
         except KeyboardInterrupt:
             if not self.orderly:
                 raise
@@ -193,7 +193,7 @@ class Pair:
         return False
 
     @contextlib.contextmanager
-    def _started(self, command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
+    def _start(self, command: list[str], core: int | None) -> Iterator[subprocess.Popen]:
         quiet = subprocess.DEVNULL
         process = subprocess.Popen(
             command,
@@ -213,7 +213,7 @@ class Pair:
             process.wait()
 
 
-def _first_line(process: subprocess.Popen, expected: str) -> str:
+def _read_first_line(process: subprocess.Popen, expected: str) -> str:
     """The line that a process prints when it is ready."""
     line = process.stderr.readline()
     if not line.startswith(expected):
@@ -221,7 +221,7 @@ def _first_line(process: subprocess.Popen, expected: str) -> str:
     return line
 
 
-def _until(
+def _wait_for_end(
     fake: subprocess.Popen,
     watch: Callable[[int], None] | None,
     runner: subprocess.Popen,

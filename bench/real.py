@@ -113,7 +113,7 @@ def change_channels(
     return lambda logs: [one(log) for log in logs]
 
 
-def late(names: Sequence[str], by: float = LATE) -> Callable[[Logs], Logs]:
+def delay_stamps(names: Sequence[str], by: float = LATE) -> Callable[[Logs], Logs]:
     """Return a change that delays some channels' stamps in all logs."""
     return lambda logs: [
         FlightLog(
@@ -124,7 +124,7 @@ def late(names: Sequence[str], by: float = LATE) -> Callable[[Logs], Logs]:
     ]
 
 
-def first(change: Callable[[Logs], Logs]) -> Callable[[Logs], Logs]:
+def change_first(change: Callable[[Logs], Logs]) -> Callable[[Logs], Logs]:
     """Return a change of the first log alone."""
     return lambda logs: [*change(logs[:1]), *logs[1:]]
 
@@ -155,7 +155,7 @@ def share(k: int, of: int = 3) -> Callable[[Logs], Logs]:
     return lambda logs: logs[k::of]
 
 
-def without(k: int, of: int = 3) -> Callable[[Logs], Logs]:
+def keep_others(k: int, of: int = 3) -> Callable[[Logs], Logs]:
     """All others."""
     return lambda logs: [log for i, log in enumerate(logs) if i % of != k]
 
@@ -239,7 +239,7 @@ SWING = ("pendulum_single/single_pendulum_id.csv.gz",)
 STAND = "motor_prop_stand/all_tests.csv.gz"
 
 
-def _without(files: Sequence[str], setup: str, name: str) -> list[Case]:
+def _predict_each(files: Sequence[str], setup: str, name: str) -> list[Case]:
     """Each flight of a set predicted from the others."""
     return [
         Case(
@@ -253,8 +253,8 @@ def _without(files: Sequence[str], setup: str, name: str) -> list[Case]:
 
 
 SETS = (
-    *_without(NANO, "nanobench_cf21", "nanobench"),
-    *_without(CF, "cf_payload", "payload_cf_single"),
+    *_predict_each(NANO, "nanobench_cf21", "nanobench"),
+    *_predict_each(CF, "cf_payload", "payload_cf_single"),
     Case("set slungload, bag 17 unseen", "gimbal", SLUNG[:1], test=SLUNG[1:]),
     Case("set slungload, bag 16 unseen", "gimbal", SLUNG[1:], test=SLUNG[:1]),
     # between these sessions the capture was calibrated anew (the repository's notes on them): its
@@ -266,7 +266,7 @@ SETS = (
             f"set jugglebot, third {k + 1} of session {n} unseen",
             "jugglebot",
             (file,),
-            without(k),
+            keep_others(k),
             test=(file,),
             of_test=share(k),
         )
@@ -329,9 +329,19 @@ TRAPS = (
     _spoil(
         "y mirrored", change_channels(PATHS, lambda v: v * [1, -1, 1]), r"\(x,-y,z\) of positions"
     ),
-    Case("trap attitude, IMU and thrust late", "cf_payload", CF3, late(AIRBORNE), expect=LATER),
-    Case("trap payload late", "cf_payload", CF3, late(["payload_pos_w"]), expect=LATER),
-    _spoil("one of three logs late", first(late(AIRBORNE)), rf"left out: log204.*({LATER})"),
+    Case(
+        "trap attitude, IMU and thrust late",
+        "cf_payload",
+        CF3,
+        delay_stamps(AIRBORNE),
+        expect=LATER,
+    ),
+    Case("trap payload late", "cf_payload", CF3, delay_stamps(["payload_pos_w"]), expect=LATER),
+    _spoil(
+        "one of three logs late",
+        change_first(delay_stamps(AIRBORNE)),
+        rf"left out: log204.*({LATER})",
+    ),
     _spoil(
         "thrust of another flight", another_thrust, r"thrust of another flight|stream of the thrust"
     ),
@@ -528,7 +538,7 @@ def _measure_unseen(
     return {channel: list(errors) for channel, errors in measured.items()}
 
 
-def won_back(errors: Sequence[float]) -> float:
+def share_removed(errors: Sequence[float]) -> float:
     """Share of the error above the noise that is removed."""
     before, after, floor = errors
     return (before - after) / (before - floor)
@@ -587,7 +597,7 @@ def table(rows: Sequence[dict]) -> str:
             for c, g in row.get("gain", {}).items()
         )
         unseen = "; ".join(
-            f"{c} {100 * won_back(e):.0f} %" for c, e in row.get("unseen", {}).items()
+            f"{c} {100 * share_removed(e):.0f} %" for c, e in row.get("unseen", {}).items()
         )
         mark = "" if "ok" not in row else "right: " if row["ok"] else "WRONG: "
         lines.append(

@@ -66,7 +66,7 @@ def seconds(
     return statistics.median(times)
 
 
-def whole(trainer: Any, iterations: int) -> dict[str, list[float]]:
+def time_iterations(trainer: Any, iterations: int) -> dict[str, list[float]]:
     """Wall time [s] of rollouts and updates as training makes them."""
     for _ in range(WARM_UP):
         trainer.step()
@@ -192,7 +192,7 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     from visthrow.training.trainer import Trainer
 
     trainer = Trainer(experiment, device, seed=1)
-    runs = whole(trainer, iterations)
+    runs = time_iterations(trainer, iterations)
     total = {key: statistics.median(values) for key, values in runs.items()}
     parts = split(total, time_parts_alone(trainer, repeats))
     samples = trainer.algorithm.samples

@@ -143,7 +143,7 @@ def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: f
             if (work / f"{name}-{seed}" / "figures.json").exists():
                 continue
             device = free.pop(0)
-            running[_begun(name, seed, device, deadline, args)] = (name, seed, device, time.time())
+            running[_begin(name, seed, device, deadline, args)] = (name, seed, device, time.time())
         if not running and deadline - time.time() <= LEAST + RESERVE:
             break
         time.sleep(0.5)
@@ -152,7 +152,7 @@ def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: f
     print("not begun:", *(f"{name}-{seed}" for name, seed in jobs), flush=True)
 
 
-def _begun(
+def _begin(
     name: str, seed: int, device: str, deadline: float, args: argparse.Namespace
 ) -> subprocess.Popen:
     words = [sys.executable, "-m", "bench.vision_ablation", args.out, "--work", args.work]

@@ -29,7 +29,7 @@ mirror's plane.
 Values = Callable[[np.ndarray], np.ndarray]
 
 
-def with_values(
+def change_channels(
     log: FlightLog, changes: dict[str, Values], time: Values = lambda t: t
 ) -> FlightLog:
     """A log with some channels' values changed, and the clock of all."""
@@ -53,7 +53,7 @@ def turn_hall(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog
         return np.column_stack((b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z))
 
     place = lambda p: p @ turn.T + np.asarray(shift)  # noqa: E731
-    return with_values(log, {"pos_w": place, "payload_pos_w": place, "quat_wb": quat})
+    return change_channels(log, {"pos_w": place, "payload_pos_w": place, "quat_wb": quat})
 
 
 def mirror_flight(log: FlightLog) -> FlightLog:
@@ -66,10 +66,10 @@ def mirror_flight(log: FlightLog) -> FlightLog:
         "payload_pos_w": place,
         "quat_wb": lambda q: q * [-1.0, 1.0, -1.0, 1.0],
     }
-    return with_values(log, changes | {"command": lambda u: u * [1.0, -1.0, 1.0, -1.0]})
+    return change_channels(log, changes | {"command": lambda u: u * [1.0, -1.0, 1.0, -1.0]})
 
 
-def mirrored_theta(theta: dict[str, float]) -> dict[str, float]:
+def mirror_theta(theta: dict[str, float]) -> dict[str, float]:
     """The expected diagnosis of mirrored flights."""
     return {
         MIRRORED.get(name, name): -size if name in NEGATED else size for name, size in theta.items()
@@ -78,7 +78,7 @@ def mirrored_theta(theta: dict[str, float]) -> dict[str, float]:
 
 def later(log: FlightLog, seconds: float) -> FlightLog:
     """All clocks of a log set forward."""
-    return with_values(log, {}, lambda t: t + seconds)
+    return change_channels(log, {}, lambda t: t + seconds)
 
 
 def scramble_poses(logs: Sequence[FlightLog]) -> list[FlightLog]:

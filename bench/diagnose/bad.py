@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.diagnose.altered import later, scramble_poses, with_values
+from bench.diagnose.altered import change_channels, later, scramble_poses
 from bench.diagnose.cases import command_for, environment, logs_of
 from bench.diagnose.sealed import WITHOUT_TESTS
 from bench.worlds.world import Recipe
@@ -38,7 +38,7 @@ def change_all(change: Callable[[FlightLog], FlightLog]) -> Callable[[Logs], Log
 
 def values(**changes) -> Callable[[Logs], Logs]:
     """Channels' values changed in all logs."""
-    return change_all(lambda log: with_values(log, changes))
+    return change_all(lambda log: change_channels(log, changes))
 
 
 def cut(log: FlightLog, count: int) -> FlightLog:
@@ -59,7 +59,7 @@ def exchange_bodies(log: FlightLog) -> FlightLog:
     return FlightLog(channels, {})
 
 
-def late_commands(log: FlightLog) -> FlightLog:
+def delay_commands(log: FlightLog) -> FlightLog:
     """Commands stamped half a second late."""
     moved = later(FlightLog({n: log[n] for n in ("command", "release_command")}, {}), 0.5)
     return FlightLog(dict(log.channels) | moved.channels, {})
@@ -72,7 +72,7 @@ def freeze_tracking(log: FlightLog) -> FlightLog:
         half = len(x) // 2
         return np.concatenate((x[:half], np.repeat(x[half : half + 1], len(x) - half, axis=0)))
 
-    return with_values(log, {"pos_w": hold, "quat_wb": hold, "payload_pos_w": hold})
+    return change_channels(log, {"pos_w": hold, "quat_wb": hold, "payload_pos_w": hold})
 
 
 def stand_still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
@@ -137,7 +137,7 @@ def wander(seconds: float, rate: float = 100.0) -> FlightLog:
     )
 
 
-def without(name: str) -> Callable[[Logs], Logs]:
+def drop_channel(name: str) -> Callable[[Logs], Logs]:
     """A channel that was not recorded."""
     return change_all(
         lambda log: FlightLog({n: c for n, c in log.channels.items() if n != name}, {})
@@ -203,7 +203,7 @@ def double_flights(logs: Logs) -> Logs:
     return [*logs, *[later(log, 1000.0) for log in logs]]
 
 
-def as_they_are(logs: Logs) -> Logs:
+def keep_all(logs: Logs) -> Logs:
     """Unchanged."""
     return logs
 
@@ -241,15 +241,15 @@ BAD = {
     "scalar_first": Bad(values(quat_wb=lambda q: q[:, [3, 0, 1, 2]])),
     "world_to_body": Bad(values(quat_wb=lambda q: q * [-1.0, -1.0, -1.0, 1.0])),
     "bodies_exchanged": Bad(change_all(exchange_bodies)),
-    "late_commands": Bad(change_all(late_commands)),
+    "late_commands": Bad(change_all(delay_commands)),
     "frozen": Bad(change_all(freeze_tracking)),
     "copied": Bad(double_flights),
     "mixed_up": Bad(scramble_poses),
     "three_samples": Bad(change_all(lambda log: cut(log, 3))),
-    "no_commands": Bad(without("command")),
-    "no_attitude": Bad(without("quat_wb")),
-    "truncated": Bad(as_they_are, cut_to=0.6),
-    "empty_files": Bad(as_they_are, cut_to=0.0),
+    "no_commands": Bad(drop_channel("command")),
+    "no_attitude": Bad(drop_channel("quat_wb")),
+    "truncated": Bad(keep_all, cut_to=0.6),
+    "empty_files": Bad(keep_all, cut_to=0.0),
     "standing": Bad(idle_on_floor, flown=False),
     # its blades do not flap, and its rates follow the commands at once
     "two_hours": Bad(hours, flown=False, right={"flapping": -1.0, "rate_gain": 1.0}),

@@ -292,7 +292,7 @@ def leftright(recipe: Recipe, folder: Path) -> dict:
         recipe,
         folder,
         lambda logs: [altered.mirror_flight(log) for log in logs],
-        altered.mirrored_theta,
+        altered.mirror_theta,
     )
 
 

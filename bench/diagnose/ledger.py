@@ -150,7 +150,7 @@ def format_interval(
     return "{} [{}, {}]".format(*texts)
 
 
-def met(interval: tuple[float, float, float], limit: float) -> str:
+def judge_limit(interval: tuple[float, float, float], limit: float) -> str:
     """Whether a size and its interval lie below a limit."""
     if math.isnan(limit):
         return "-"
@@ -187,7 +187,7 @@ def accuracy(worlds: Sequence[dict]) -> list[str]:
         "|---|---:|---:|---:|---|---|---|---|---:|---:|---:|---:|---:|",
     ]
     for kind, begun in group_by_key(worlds, lambda w: w["kind"]).items():
-        group = answered_worlds(begun)
+        group = select_answered(begun)
         finished = [w for w in group if "error" not in w]
         counts = np.array([names(w) for w in group]).reshape(-1, 4)
         given, right, exact, hits = map(int, counts.sum(0))
@@ -215,7 +215,7 @@ def dusty(world: dict) -> bool:
     return bool(world["recipe"].get("dust"))
 
 
-def answered_worlds(worlds: Sequence[dict]) -> list[dict]:
+def select_answered(worlds: Sequence[dict]) -> list[dict]:
     """Worlds whose verdict was not cut off."""
     return [w for w in worlds if w.get("error") != NOT_WAITED]
 
@@ -283,7 +283,7 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
             half = fitted.size(0.5)
             most = fitted.size(0.9)
             row += [format_interval(x, size, floor * factor) for x in (half, most)]
-            row += [required, met(most, limit / floor)]
+            row += [required, judge_limit(most, limit / floor)]
         else:
             row += ["-", "-", required, "too few worlds" if name in LIMITS else "-"]
         lines.append("| " + " | ".join(map(str, row)) + " |")
@@ -470,7 +470,7 @@ def _panel(axis, worlds: tuple[np.ndarray, np.ndarray] | None, limit: float, sca
 
 def summary(worlds: Sequence[dict]) -> str:
     """All tables as Markdown."""
-    answers = answered_worlds(worlds)
+    answers = select_answered(worlds)
     parts = {
         "What was named": accuracy(worlds),
         "By kind": kinds(answers),
@@ -580,9 +580,9 @@ def main() -> None:
     args = parser.parse_args()
     worlds = read(args.ledgers)
     print(summary(worlds))
-    if args.out and singles(answered_worlds(worlds)):
+    if args.out and singles(select_answered(worlds)):
         args.out.mkdir(parents=True, exist_ok=True)
-        draw(answered_worlds(worlds), args.out / "completeness.png")
+        draw(select_answered(worlds), args.out / "completeness.png")
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ def answer_of(tree: str, arguments: list[str], folder: Path, until: float) -> di
     return json.loads(answer.read_text()) | {"seconds": seconds}
 
 
-def in_turn(trees: list[str], number: int) -> list[tuple[str, str]]:
+def order_sides(trees: list[str], number: int) -> list[tuple[str, str]]:
     """Return the sides with their trees; for every second world the new one answers first."""
     sides = list(zip(SIDES[-len(trees) :], trees))
     return sides if number % 2 else sides[::-1]
@@ -106,7 +106,7 @@ def answer_foreign(seed: int, trees: list[str], until: float) -> dict:
         for i in range(foreign.FLIGHTS):
             log = foreign.fly_lissajous(world, np.random.default_rng([seed, i]))
             log.save(folder / f"flight_{i}.npz")
-        for side, tree in in_turn(trees, seed):
+        for side, tree in order_sides(trees, seed):
             verdict = answer_of(tree, [FOREIGN, vehicle, str(seed)], folder, until)
             groups = sealed.named_causes(verdict)
             line[side] = {
@@ -133,7 +133,7 @@ def answer_sealed(kind: str, recipe: Recipe, trees: list[str], until: float) -> 
         for item in sealed.model_of(recipe):
             explain += ["--set", item]
         sizes = {}
-        for side, tree in in_turn(trees, recipe.seed):
+        for side, tree in order_sides(trees, recipe.seed):
             verdict = answer_of(tree, explain, folder, until)
             line[side] = sealed.judge(recipe, verdict) | {
                 "errors": sealed.errors_of(recipe, verdict),
@@ -332,7 +332,7 @@ def compare(args: argparse.Namespace) -> None:
         ("  pairs", lambda line: line["kind"].startswith("2x"), names_right),
         ("  triples", lambda line: line["kind"].startswith("3x"), names_right),
         ("  foreign", lambda line: has_names(line) and line["bank"] == "foreign", names_right),
-        ("worlds without a wrong name", has_names, without_wrong),
+        ("worlds without a wrong name", has_names, has_no_wrong_name),
         ("laws: UNKNOWN, no name", is_outside, judge_outside_law),
         ("  in the grammar", lambda line: line["kind"] == "law", judge_outside_law),
         ("  beyond it", lambda line: line["kind"] == "beyond", judge_outside_law),
@@ -380,7 +380,7 @@ def judge_outside_law(line: dict, side: str) -> bool:
     return unknown and not line[side]["named"]
 
 
-def without_wrong(line: dict, side: str) -> bool:
+def has_no_wrong_name(line: dict, side: str) -> bool:
     """Tell whether no name stands for nothing that was hidden."""
     if line["bank"] == "foreign":
         return line[side]["judged"] != "false"

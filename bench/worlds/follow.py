@@ -126,10 +126,10 @@ def follow(recipe: Recipe, tables: list[Table], seed: int) -> list[dict]:
         rng.uniform(0.0, 0.4, len(tables)),
     )
     out = record_flights(replace(recipe, seed=int(rng.integers(2**31))), [flown])
-    return [_trimmed(record, table) for record, table in zip(out, tables)]
+    return [_trim(record, table) for record, table in zip(out, tables)]
 
 
-def _trimmed(record: dict, table: Table) -> dict:
+def _trim(record: dict, table: Table) -> dict:
     in_window = (record["time"] >= table.begin) & (record["time"] < table.seconds)
     sent = (record["sent_time"] >= table.begin - 1e-9) & (
         record["sent_time"] < table.seconds - 1e-9

@@ -36,7 +36,7 @@ def cells(kind, group):
 
 def test_the_record_says_what_the_shipped_ledger_says():
     lines = (Path(ledger.__file__).parent / "ledgers/catalogue.jsonl").read_text().splitlines()
-    worlds = ledger.answered_worlds([json.loads(line) for line in lines])
+    worlds = ledger.select_answered([json.loads(line) for line in lines])
     tables = measurements.load(measurements.PAGES / "diagnosis-trust-page.json")["tables"]
     rows = next(t["rows"] for t in tables if t["title"].startswith("Hidden worlds"))
     for kind, (_, *shown) in zip(KINDS, rows, strict=True):

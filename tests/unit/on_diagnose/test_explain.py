@@ -5,7 +5,7 @@ import json
 import numpy as np
 from pytest import approx, fixture
 
-from bench.diagnose.altered import with_values
+from bench.diagnose.altered import change_channels
 from bench.diagnose.cases import logs_of
 from bench.worlds.world import Recipe
 from tests.commands import run_command
@@ -40,7 +40,7 @@ def once(flights, tmp_path_factory):
 
 
 def in_millimetres(log: FlightLog) -> FlightLog:
-    return with_values(log, {"pos_w": lambda x: 1e3 * x, "payload_pos_w": lambda x: 1e3 * x})
+    return change_channels(log, {"pos_w": lambda x: 1e3 * x, "payload_pos_w": lambda x: 1e3 * x})
 
 
 def test_a_copied_log_counts_once(flights, once, tmp_path):

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from pytest import approx, mark, raises
 
-from bench.diagnose.altered import with_values
+from bench.diagnose.altered import change_channels
 from tests.flightlogs import with_channels
 from tests.places import DATA
 from tests.unit.on_logs.test_check import faults
@@ -35,7 +35,7 @@ LATE = 0.1
 
 
 def change_values(log: FlightLog, names, change) -> FlightLog:
-    return with_values(log, dict.fromkeys(names, change))
+    return change_channels(log, dict.fromkeys(names, change))
 
 
 def shift(log: FlightLog, *names: str, by: float = LATE) -> FlightLog:

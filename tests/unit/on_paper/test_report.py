@@ -165,9 +165,9 @@ def test_the_command_reports_from_records(tmp_path, full, refused, printed):
 
 
 def test_what_the_report_stands_on_is_stated_once():
-    keys = [results.key_of(unit) for unit in baseline_record.full()]
+    keys = [results.key_of(unit) for unit in baseline_record.list_units()]
     assert len(set(keys)) == len(keys)
-    assert {unit["target"] for unit in baseline_record.full()} == {1.5, 2.0, 2.5}
+    assert {unit["target"] for unit in baseline_record.list_units()} == {1.5, 2.0, 2.5}
 
 
 def test_pictures_show_what_they_are_given():
