@@ -46,7 +46,7 @@ def test_its_policy_is_one_like_any_other(tmp_path):
     ("change", "message"),
     [
         ("first_order.horizon=5", "expected at least 7"),
-        ("task.target.speed=[0.0,0.5]", "stand still"),
+        ("task.target.speed=[0.0,0.5]", "stationary goals"),
         ('task.observation.layout="vision"', 'layout = "state"'),
     ],
 )

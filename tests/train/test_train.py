@@ -256,7 +256,7 @@ def test_resume_under_another_seed_or_configuration_is_refused(tmp_path, refused
     folder = tmp_path / "run"
     assert train(folder, "--iterations", "1") == 0
     refused(*words(folder, "--resume", "--seed", "2"), message="another seed, 1")
-    refused(*words(folder, "--resume", "--set", "ppo.clip=0.3"), message="another configuration")
+    refused(*words(folder, "--resume", "--set", "ppo.clip=0.3"), message="not that of --set")
     refused(
         f"train vision --resume --out {folder} --device cpu",
         message="another configuration than vision",

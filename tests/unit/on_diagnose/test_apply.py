@@ -213,9 +213,9 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
 @mark.parametrize(
     ("changes", "message"),
     [
-        ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "no effects of the throw"),
+        ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "not effects of the throw: no_such"),
         ({"covariance": [[1.0]]}, "expected 25"),
-        ({"theta": None}, "no diagnosis"),
+        ({"theta": None}, "not a diagnosis"),
         (
             {"gain": {"channels": [{"channel": "pos_w", "before": 1.0, "after": 1.5}]}},
             "do not confirm this",
@@ -294,7 +294,7 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
             "jugglebot",
             "ball_drag in 'N'; the ball's ball_drag is in '1/m'",
         ),
-        ({"thrust": 1.0}, "N", "jugglebot", "thrust are not effects of the ball"),
+        ({"thrust": 1.0}, "N", "jugglebot", "not effects of the ball: thrust"),
     ):
         report = diagnosis(
             **{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]}
@@ -319,7 +319,7 @@ def test_a_broken_covariance_is_refused():
     with raises(ConfigError, match="one row and one column"):
         DiagnosedParams(("rope_length",), ((1.0, 2.0),), 2)
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
-    with raises(ConfigError, match="no covariance"):
+    with raises(ConfigError, match="not a covariance"):
         draw_plants(replace(shipped(), diagnosed=bad), 0)
 
 

@@ -108,7 +108,7 @@ class SavedDiagnosis:
         strange = [name for name in theta if name not in effects]
         if strange:
             raise DiagnoseError(
-                f"{self.path}: {', '.join(strange)} are not effects of the {self.model};"
+                f"{self.path}: not effects of the {self.model}: {', '.join(strange)};"
                 f" {suggest(strange[0], effects)}"
             )
         findings = self.report.get("findings") or []
