@@ -64,7 +64,7 @@ def proximity(p: RewardParams, clearance: Tensor, margin: float) -> Tensor:
 def release_reward(
     p: RewardParams, error: Tensor, time: Tensor, clearance: Tensor, margin: float
 ) -> Tensor:
-    """Return r_land + r_tof + r_prox of a release, shape (E,). Arguments: see :func:`landing_reward`,
-    :func:`time_of_flight` and :func:`proximity`.
+    """Return r_land + r_tof + r_prox of a release, shape (E,). Arguments: see
+    :func:`landing_reward`, :func:`time_of_flight` and :func:`proximity`.
     """
     return landing_reward(p, error) + time_of_flight(p, time) + proximity(p, clearance, margin)
