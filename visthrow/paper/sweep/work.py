@@ -133,7 +133,9 @@ def train(
     status = 1
     try:
         status = session.run(args)
-        status = status if status or source.is_done(out) else EXIT_STOPPED  # stopped by the time limit
+        status = (
+            status if status or source.is_done(out) else EXIT_STOPPED
+        )  # stopped by the time limit
     finally:
         piece = {
             "start": began,
