@@ -2,9 +2,9 @@
 next diagnosis read.
 """
 
-import dataclasses
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,12 @@ from visthrow.diagnose.inputs.fit import list_covariance
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import term_of
+from visthrow.diagnose.models.model_interface import Sizes
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, load_experiment, plant_of
 
 
-def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
+def extended(experiment: Experiment, theta: Sizes) -> Experiment:
     """The experiment whose plant and sensors have these effects.
 
     Raises ConfigError: an effect that the catalogue does not hold.
@@ -36,7 +37,7 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
     base = generalise(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
     sizes = apply(choose_effects(theta), base, theta)
     plant = specialise(sizes.plant, plant_of(experiment))
-    return dataclasses.replace(
+    return replace(
         experiment,
         vehicle=plant.vehicle,
         rope=plant.rope,
@@ -63,7 +64,7 @@ def differences(before: Any, after: Any) -> dict[str, Any]:
 def text(
     base: str,
     experiment: Experiment,
-    theta: Mapping[str, float],
+    theta: Sizes,
     covariance: Sequence[Sequence[float]],
     plants: int,
     provenance: Sequence[str],
@@ -86,7 +87,7 @@ def text(
         paths = [key.path for key in effect.changes]
         if paths and all(path.startswith("plant.") for path in paths):
             of_plant.append(i)
-    varied = dataclasses.replace(
+    varied = replace(
         experiment.diagnosed,
         effects=tuple(effects[i].name for i in of_plant),
         covariance=tuple(map(tuple, covariance[np.ix_(of_plant, of_plant)].tolist())),
@@ -94,7 +95,7 @@ def text(
     )
     every_law = (*experiment.laws, *laws)
     check_laws(every_law)
-    after = dataclasses.replace(extended(experiment, theta), diagnosed=varied, laws=every_law)
+    after = replace(extended(experiment, theta), diagnosed=varied, laws=every_law)
     changed = differences(config.to_dict(load_experiment(base)), config.to_dict(after))
     words = defaultdict(list)
     for effect, sd in zip(effects, np.sqrt(np.diag(covariance))):
@@ -128,7 +129,7 @@ def _file(
 
 
 def without_transient(
-    theta: Mapping[str, float], covariance: np.ndarray
+    theta: Sizes, covariance: np.ndarray
 ) -> tuple[dict[str, float], np.ndarray, list[str]]:
     """Leave out effects that belong to the diagnosed flights and not to the vehicle.
 
@@ -160,9 +161,7 @@ def with_firmware(
         controller = controller_of(plant.vehicle, settings, weight, voltage)
     except ValueError as error:
         raise DiagnoseError(f"{path}: {error}") from error
-    changed = differences(
-        dataclasses.asdict(plant.vehicle.controller), dataclasses.asdict(controller)
-    )
+    changed = differences(asdict(plant.vehicle.controller), asdict(controller))
     comments = [
         f"Controller by the settings of {settings.get('Firmware revision', 'a firmware').strip()}"
         f" in {Path(path).name}."
@@ -204,7 +203,7 @@ def of_setup(
     words = {}
     comments = [*provenance, *list_covariance(list(theta), covariance)]
     if laws := saved.laws(rank):
-        changed["laws"] = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
+        changed["laws"] = [asdict(law) for law in (*setup.laws, *laws)]
         rows = [x.get("covariance") or [x["sd"] ** 2] for x in saved.explanation(rank)]
         comments += list_covariance([term_of(law).formula for law in laws], rows)
     if theta:

@@ -14,6 +14,7 @@ from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.diagnose.inputs.model_arguments import THROW
 from visthrow.diagnose.models.catalogue import beyond_bounds
+from visthrow.diagnose.models.model_interface import Sizes
 
 HARM = 0.02  # share by which a channel may get worse on held-out flights
 
@@ -99,7 +100,7 @@ class SavedDiagnosis:
             raise DiagnoseError(f"{self.path}: {asked}; {choices}")
         return explanations[rank - 1] if rank else []
 
-    def refuse_strange(self, theta: Mapping[str, float], effects: Mapping[str, Effect]) -> None:
+    def refuse_strange(self, theta: Sizes, effects: Mapping[str, Effect]) -> None:
         """Refuse effects that are none of the model's, though they may bear the same name, and
         sizes that it cannot have.
 

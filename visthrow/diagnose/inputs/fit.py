@@ -18,7 +18,7 @@ from sim.params import VehicleParams, change_values
 from visthrow import config
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
-from visthrow.diagnose.models.model_interface import Model, Window
+from visthrow.diagnose.models.model_interface import Model, Sizes, Window
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_FREE = {
@@ -138,7 +138,7 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     )
 
 
-def _vehicle_of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
+def _vehicle_of_flyer(p: Any, size: Sizes, base: VehicleParams) -> VehicleParams:
     gain = 1.0 + size["thrust_gain"]
     mass = p.mass + size["mass_quad"]
     drag_xy = p.drag_xy + size["rotor_drag_xy"]

@@ -125,7 +125,7 @@ def correlations(
     bare = parallel_map(partial(hidden_gram, channels=channels), free)
     fits = noise.widely_fitted(free, bare)
     residuals = parallel_map(residual_after_fit, free, fits)
-    correlations_of: dict[int, Correlation] = {}
+    correlations_of = {}
     for channel in range(channels):
         scale = _suspect_deviation(free, residuals, channel)
         if scale is None:
@@ -193,8 +193,8 @@ def _likeliest(
     if period > LONGEST:
         return white[0], 0.0
     none = max(_likelihood(windows, channels, correlations_of, channel, w)[0] for w in white)
-    tried: list[tuple[float, Correlation]] = []
-    levels: noise.Noise | None = None
+    tried = []
+    levels = None
 
     def shortfall(place: ndarray, order: int) -> float:
         nonlocal levels

@@ -28,7 +28,7 @@ from scipy.special import log_ndtr, ndtri
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.models.model_interface import Effect
+from visthrow.diagnose.models.model_interface import Effect, Indices
 
 POSSIBLE = 1.0 / 20.0
 ALARM = 1.0 / 150.0
@@ -119,7 +119,7 @@ class Priors:
             raise DiagnoseError(f"two effects share a name: {', '.join(twice)}")
         floor = np.array([e.floor for e in effects], dtype=float)
         bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2)
-        switch = np.array([bool(e.switch) for e in effects], dtype=bool)
+        switch = np.array([e.switch for e in effects], dtype=bool)
         bounds[switch, 0] = (1.0 - INEXACT) * bounds[switch, 1]
         bounds /= floor[:, None]
         prior = np.array([e.prior_sd for e in effects], dtype=float) / floor
@@ -132,7 +132,7 @@ class Priors:
         """Return the log prior mass of each effect within its bounds, if selected, shape (K,)."""
         return _log_mass(np.zeros_like(self.slab), self.slab, self.low, self.high)
 
-    def deviation(self, active: Sequence[int]) -> ndarray:
+    def deviation(self, active: Indices) -> ndarray:
         """Return the prior standard deviations if these effects are selected, shape (K,)."""
         spread = np.full(len(self.floor), SPIKE)
         spread[list(active)] = self.slab[list(active)]
@@ -180,7 +180,7 @@ class Posterior:
             )
         return factor
 
-    def covariance(self, active: Sequence[int]) -> ndarray:
+    def covariance(self, active: Indices) -> ndarray:
         """Return the posterior covariance (I + D^-1)^-1 with these effects selected, shape (K,
         K).
         """
@@ -189,13 +189,13 @@ class Posterior:
         inverse = lapack.dpotrs(factor, np.eye(len(deviation)), lower=1)[0]
         return inverse * np.outer(deviation, deviation)
 
-    def mean(self, active: Sequence[int]) -> ndarray:
+    def mean(self, active: Indices) -> ndarray:
         """Return the posterior mean of every effect's size with these effects selected, shape
         (K,).
         """
         return self.covariance(active) @ self.score
 
-    def log_evidence(self, active: Sequence[int]) -> float:
+    def log_evidence(self, active: Indices) -> float:
         """Return log Z of one set of selected effects [nats]."""
         columns = list(active)
         deviation = self.priors.deviation(columns)
@@ -210,14 +210,14 @@ class Posterior:
             value += self._log_within(columns, slab * mean[columns], spread).sum()
         return float(value)
 
-    def _log_within(self, sets: Sequence[int] | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
+    def _log_within(self, sets: Indices | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
         """Return the log of the posterior mass within the effects' bounds, minus that of the
         prior.
         """
         priors = self.priors
         return _log_mass(mean, sd, priors.low[sets], priors.high[sets]) - priors.log_within[sets]
 
-    def additions(self, active: Sequence[int]) -> ndarray:
+    def additions(self, active: Indices) -> ndarray:
         """Return the gain of log Z if one more effect is selected, for each effect.
 
         A change of one prior is a rank-one update, so all effects and all draws together cost one
@@ -225,7 +225,7 @@ class Posterior:
         selected or not visible."""
         return self._naming(active, np.arange(len(self.priors.floor))[:, None])
 
-    def pair_additions(self, active: Sequence[int]) -> ndarray:
+    def pair_additions(self, active: Indices) -> ndarray:
         """Return the gain of log Z if a pair of effects is selected, for each pair.
 
         Two effects that cancel each other show no gain alone. Returns nats, shape (K, K),
@@ -237,7 +237,7 @@ class Posterior:
         gain[rows, columns] = self._naming(active, np.stack((rows, columns), axis=1))
         return np.maximum(gain, gain.T)
 
-    def _naming(self, active: Sequence[int], sets: ndarray) -> ndarray:
+    def _naming(self, active: Indices, sets: ndarray) -> ndarray:
         """Return the gain of log Z if m more effects are selected, for P sets of them; ``sets``:
         their indices, shape (P, m).
         """
@@ -262,7 +262,7 @@ class Posterior:
         out[list(active)] = True
         return np.where(out[sets].any(1), -np.inf, gain)
 
-    def estimate(self, active: Sequence[int]) -> ndarray:
+    def estimate(self, active: Indices) -> ndarray:
         """Return the most probable sizes of the selected effects within their bounds, 0 for all
         others; in floors, shape (K,).
         """
@@ -293,7 +293,7 @@ class Posterior:
         variance = np.average(variances + (means - mean) ** 2, weights=weights)
         return float(mean), float(np.sqrt(variance))
 
-    def mean_sizes(self, active: Sequence[int], sets: Sets) -> ndarray:
+    def mean_sizes(self, active: Indices, sets: Sets) -> ndarray:
         """Return the means of the selected effects by :meth:`averaged`, clipped to their bounds,
         and 0 for all others; in floors, shape (K,).
         """
@@ -304,7 +304,7 @@ class Posterior:
             theta[j] = np.clip(mean, self.priors.low[j], self.priors.high[j])
         return theta
 
-    def certainty(self, theta: ndarray, active: Sequence[int]) -> ndarray:
+    def certainty(self, theta: ndarray, active: Indices) -> ndarray:
         """Return the sizes of selected effects divided by the half widths of their 95 % intervals,
         which are widened by half a floor; in the order of ``active``.
 
@@ -314,7 +314,7 @@ class Posterior:
         variance = np.diag(self.covariance(columns))[columns]
         return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(variance), SPIKE))
 
-    def certainly_nonzero(self, active: Sequence[int]) -> list[int]:
+    def certainly_nonzero(self, active: Indices) -> list[int]:
         """Drop the least certain of the selected effects until all others are surely not 0; return
         those.
         """

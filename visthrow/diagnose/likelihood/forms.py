@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.marginal import Noise
-from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.models.model_interface import Indices, Window
 from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 HEAD = 0.4  # share of a window, at most HEAD_SECONDS, in which the initial state is fitted
@@ -68,7 +68,7 @@ class Errors:
 
 def errors(
     windows: Sequence[Window],
-    groups: Sequence[int],
+    groups: Indices,
     noise: Noise,
     residuals: Sequence[ndarray],
     channels: int,

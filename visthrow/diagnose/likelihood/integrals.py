@@ -13,12 +13,7 @@ from numpy import ndarray
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.marginal import (
-    Gram,
-    Noise,
-    Statistics,
-    without_rounding,
-)
+from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, without_rounding
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
@@ -43,7 +38,7 @@ class _Shape:
     def projected(self, gram: Gram) -> ndarray:
         """Return L^-1 P^1/2 U' W r of a window's residuals, shape (n,)."""
         cross = self.weight @ gram.cross[:, : gram.hidden]
-        part: ndarray = self.root @ (self.level * cross)
+        part = self.root @ (self.level * cross)
         return part
 
     def square(self, gram: Gram) -> float:

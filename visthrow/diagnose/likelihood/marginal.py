@@ -23,7 +23,7 @@ from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.models.model_interface import Indices, Window
 
 TAIL = 6.0
 """Degrees of freedom of the latent forces' scale mixture. Their standard deviation varies by some
@@ -116,7 +116,7 @@ class Statistics:
     square: ndarray  # r' V^-1 r + log det V, shape (F,)
     samples: ndarray  # shape (F,)
     theta: ndarray  # shape (K,), or that of each row, shape (F, K)
-    days: Sequence[int] = ()  # of each flight; none where the logs do not say
+    days: Indices = ()  # of each flight; none where the logs do not say
 
     @cached_property
     def absolute(self) -> "Statistics":
@@ -145,7 +145,7 @@ class Statistics:
         """Return the statistics of some rows; ``keep`` is a mask or indices."""
         return self._with_rows(self.flights[keep], lambda values: values[keep])
 
-    def by(self, groups: Sequence[int]) -> "Statistics":
+    def by(self, groups: Indices) -> "Statistics":
         """Add up the rows of each group; ``groups``: the group of each row, shape (F,)."""
         numbers = np.unique(groups)
         members = np.equal.outer(numbers, groups).astype(float)
@@ -269,7 +269,7 @@ def check(window: Window, effects: int, channels: int) -> None:
         raise DiagnoseError(
             f"{where}: {n} residuals and {effects} effects, but {wrong or window.effects.shape}"
         )
-    if n and (window.channel.max() >= channels or not np.all(window.sigma > 0.0)):
+    if n and (window.channel.max() >= channels or not (window.sigma > 0.0).all()):
         raise DiagnoseError(
             f"{where}: a channel index above {channels - 1}, or a sigma that is not above 0"
         )

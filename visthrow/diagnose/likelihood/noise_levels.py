@@ -5,6 +5,7 @@ plants a fault for each. Single samples far out lose weight (Huber). A window's 
 stronger or weaker than those of its phase: their variance has an inverse gamma prior, so the forces
 have the heavy tails of a Student distribution. Every level is bounded."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +24,7 @@ from visthrow.diagnose.likelihood.marginal import (
     without_effects,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
 
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
@@ -78,14 +79,11 @@ def fit(
     identity; ``start``: an earlier estimate, which gives the correlation time and the levels from
     which the search starts. Returns the levels, and the grams with their latent forces correlated
     accordingly."""
-    noise = start
-    time = CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):
-        noise = _likeliest(windows, grams)
-        time = noise.correlation_time
+        start = _likeliest(windows, grams)
+    time = CORRELATION_TIMES[0] if start is None else start.correlation_time
     shaped = correlated_of(grams, windows, time)
-    begin = replace(noise or _guess(shaped), correlation_time=time)
-    return maximised(shaped, begin)[0], shaped
+    return maximised(shaped, start or _guess(shaped))[0], shaped
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
@@ -114,7 +112,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
     return levels_of[best][0]
 
 
-def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
+def only(noise: Noise, grams: Sequence[Gram], windows: Indices) -> Noise:
     """Return the levels for some of the windows, whose ``grams`` these are; levels that are not
     known yet are guessed.
     """
@@ -136,12 +134,11 @@ def _guess(grams: Sequence[Gram]) -> Noise:
     visible.
     """
     scale = np.ones(len(grams[0].count))
-    visible: dict[tuple[int, str], list[float]] = {}
+    visible = defaultdict(list)
     for gram in grams:
         for block, information in gram.visibility.items():
             if information > 0.0:  # else these forces have no effect on the window
-                levels = visible.setdefault((block, gram.phase), [])
-                levels.append(1.0 / np.sqrt(information))
+                visible[block, gram.phase].append(1.0 / np.sqrt(information))
     medians = {key: np.median(levels) for key, levels in visible.items()}
     share = np.ones((len(grams), len(LATENT_BLOCKS)))
     return Noise(scale, medians, CORRELATION_TIMES[0], share)

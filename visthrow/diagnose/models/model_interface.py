@@ -19,6 +19,11 @@ from numpy import ndarray
 from sim.effects.effect import Effect
 from sim.params import LawParams
 
+Indices = Sequence[int]
+"""Indices of effects, windows or flights, from 0."""
+Sizes = Mapping[str, float]
+"""Sizes of effects by their names, in their units; an effect that is not among them has size 0."""
+
 
 def _no_indices() -> ndarray:
     return np.zeros(0, dtype=int)
@@ -69,7 +74,7 @@ class Linearised:
     Without the adjustment, a window would begin with a transient that the derivatives do not
     contain, such as unbalanced rotors."""
 
-    theta: Mapping[str, float]  # argument of :meth:`Model.windows`
+    theta: Sizes  # argument of :meth:`Model.windows`
     windows: Mapping[int, Window]  # returned windows, by index
 
 
@@ -89,7 +94,7 @@ class Model(Protocol):
     # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
     channels: Sequence[str]
     device: str = "cpu"  # of the simulation
-    days: Sequence[int] = ()  # day of each flight, by index; empty if the logs do not state it
+    days: Indices = ()  # day of each flight, by index; empty if the logs do not state it
     mistakes: Sequence[Any] = ()  # mistakes of the logs that were corrected
     cheap: bool = False  # whether derivatives are taken again at each step of the search
     bends: bool = False  # whether laws are so nonlinear that the search must simulate them
@@ -98,13 +103,13 @@ class Model(Protocol):
     notes: Sequence[str] = ()  # sentences about parts of the flights that are not used
     not_offered: int = 0  # number of applicable effects that the user excluded
 
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+    def windows(self, theta: Sizes) -> list[Window]:
         """Simulate all windows with the effects at ``theta`` (0 by default), and linearise
         there.
         """
         ...
 
-    def residuals(self, theta: Mapping[str, float], linearised: Linearised) -> list[ndarray]:
+    def residuals(self, theta: Sizes, linearised: Linearised) -> list[ndarray]:
         """Return the residuals of :meth:`windows` alone, one array of shape (N,) for each window.
 
         Args:
@@ -116,7 +121,7 @@ class Model(Protocol):
         """
         ...
 
-    def possible(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+    def possible(self, theta: Sizes) -> Sizes:
         """Limit sizes, each within its bounds, to what is possible together."""
         return theta
 
@@ -128,7 +133,7 @@ class Model(Protocol):
         """Return the model with further laws; itself if none can act in it."""
         return self
 
-    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
+    def without_commands(self, theta: Sizes, windows: Indices) -> list[ndarray]:
         """Return the change of some windows' samples if a command is lost, for each command, shape
         (N, T) each; empty if the model has no commands.
 
@@ -144,9 +149,7 @@ class Model(Protocol):
         """
         return None
 
-    def landings(
-        self, theta: Mapping[str, float], flights: Sequence[int] | None = None
-    ) -> Any | None:
+    def landings(self, theta: Sizes, flights: Indices | None = None) -> Any | None:
         """Return predicted and measured landings (``PredictedLandings``); None if no landing was
         measured.
         """

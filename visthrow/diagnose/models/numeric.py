@@ -18,7 +18,7 @@ from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import Term, carries, term_of
 from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
-from visthrow.diagnose.models.model_interface import Linearised, Model, Window
+from visthrow.diagnose.models.model_interface import Indices, Linearised, Model, Sizes, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import interpolate as interpolate
@@ -176,7 +176,7 @@ class NumericModel(Model, ABC):
         forces: ndarray = np.einsum("bpk,tk->tbp", latent, weights)
         return forces
 
-    def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
+    def extend(self, sizes: Sizes, laws: Sequence[LawParams] = ()) -> None:
         """Extend the model by a diagnosis: add sizes, from which further ones are counted and
         bounded, and laws.
 
@@ -193,7 +193,7 @@ class NumericModel(Model, ABC):
         self._base = base
         self.laws = (*self.laws, *laws)
         shifted = []
-        for effect, size in zip(self.effects, base.tolist()):
+        for effect, size in zip(self.effects, base):
             low, high = effect.bounds
             shifted.append(replace(effect, bounds=(low - size, high - size)))
         self.effects = tuple(shifted)
@@ -262,7 +262,7 @@ class NumericModel(Model, ABC):
             return np.zeros((len(state), 3))
         return exerted(self.laws, self.quantities(np.zeros(len(state)), state))[block]
 
-    def size(self, theta: Mapping[str, float]) -> ndarray:
+    def size(self, theta: Sizes) -> ndarray:
         """Return the total sizes of all effects in order, shape (K,).
 
         Raises LogError for an unknown effect.
@@ -289,7 +289,7 @@ class NumericModel(Model, ABC):
         """Return the sizes of several effects, shape (B, N); zeros for an empty name."""
         return np.stack([self.size_of(lanes, name) for name in names], axis=1)
 
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+    def windows(self, theta: Sizes) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         size = self.size(theta)
         self._slopes = []
@@ -315,9 +315,7 @@ class NumericModel(Model, ABC):
             windows.append(window)
         return windows
 
-    def residuals(
-        self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[ndarray]:
+    def residuals(self, theta: Sizes, linearised: Linearised | None = None) -> list[ndarray]:
         """See :class:`.model_interface.Model`; initial states are fitted anew."""
         return self._from_prior(self._settle(self.size(theta)))
 
@@ -409,7 +407,7 @@ class NumericModel(Model, ABC):
         return self._slopes_by(size, "nuisance", steps, range(steps.shape[1]))
 
     def _slopes_by(
-        self, size: ndarray, name: str, steps: ndarray, columns: Sequence[int]
+        self, size: ndarray, name: str, steps: ndarray, columns: Indices
     ) -> list[ndarray]:
         """Return the derivatives of the samples by central differences, shape (N, C) for each
         stretch.

@@ -67,7 +67,7 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     """
     full = 4.0 * plant.vehicle.controller.max_thrust
     units = thrust_checks.UNITS | {"shares of the full thrust": full}
-    mistakes: list[Mistake] = []
+    mistakes = []
     for look in (_axes, _rate_unit):
         relations = [relation for relation in map(_relate_rates, logs) if relation is not None]
         if relations and (mistake := look(relations)) is not None:
@@ -127,14 +127,14 @@ def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
     place = measured(log, "pos_w")
     if place is not None:
         height = place.at(time)[:, 2]
-        flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
+        flies &= height > height.min() + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
     start = time[flies][0]
     end = time[flies][-1]
     rows = (time >= start) & (time <= end)
     hover = np.median(share[rows])
-    if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
+    if "acc_b" not in log or share[rows].std() < VARIED * hover:
         return hover, 1.0, start, end
     acc = log["acc_b"].samples()
     first, last = acc.time[[0, -1]]
@@ -156,7 +156,7 @@ def _relate_rates(log: FlightLog) -> relations.Relation | None:
         return None
     rates = attitude.rates()
     time, command = log["command"].samples()
-    if len(rates.time) < 50 or len(time) < 20 or np.max(np.std(rates.values, axis=0)) < MOVES:
+    if len(rates.time) < 50 or len(time) < 20 or rates.values.std(0).max() < MOVES:
         return None
     relation = relations.relate(Samples(time, command[:, 1:]), rates)
     return relation if relation is not None and relation.axes_correlation > FOLLOWS else None

@@ -87,7 +87,7 @@ def cut(
         end = min(down, last)
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
-    cuts: list[Cut] = []
+    cuts = []
     for start, end, kind, payload in spans:
         phase = kind or _phase(flight, start, end)
         previous = cuts[-1].phase if cuts else phase  # the motion before the first is unknown
@@ -104,7 +104,7 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
     room = max(WINDOW_LIMIT - len(cuts) + len(plain), WINDOW_LIMIT // 4)
     if len(plain) <= room:
         return cuts
-    whole = [np.var(flight.command, axis=0) for flight in flights]
+    whole = [flight.command.var(0) for flight in flights]
     variation = {}
     for i in plain:
         number = cuts[i].flight
@@ -117,8 +117,8 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
 def _variation(flight: RecordedFlight, c: Cut, whole: ndarray) -> float:
     """Return the variance of a window's commands relative to that of the whole flight's."""
     acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
-    variance = np.var(flight.command[acts], axis=0)
-    return np.sum(variance / np.maximum(whole, TINY))
+    variance = flight.command[acts].var(0)
+    return (variance / np.maximum(whole, TINY)).sum()
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:

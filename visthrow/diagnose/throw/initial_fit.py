@@ -95,7 +95,7 @@ class _WindowFit:
         if not np.all(off < FARTHEST):
             return np.inf
         clipped = np.minimum(off, HUBER)
-        return float(np.sum(clipped * (off - 0.5 * clipped)))
+        return (clipped * (off - 0.5 * clipped)).sum()
 
     def increment(self, done: ndarray) -> tuple[ndarray, float]:
         """Return the Levenberg-Marquardt step with the vague prior, shape (directions,), and the
@@ -151,7 +151,7 @@ class _WindowFit:
         before = self.gusts
         for gusts in CALMER:
             spread = np.hypot(self.sigma, gusts * self.drift)
-            if gusts < self.gusts and np.sum((self.residual / spread) ** 2) < samples:
+            if gusts < self.gusts and ((self.residual / spread) ** 2).sum() < samples:
                 self.gusts = gusts
                 self.spread = spread
         return self.gusts < before

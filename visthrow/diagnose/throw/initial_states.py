@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
+from numpy.polynomial.polynomial import polyfit, polyval
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
@@ -199,16 +200,16 @@ def smoothed(
             if chosen.values.shape[1] == 4:
                 return _smooth_turn(since, chosen.values)
             degree = 2 if len(since) < 12 else 3
-            fit = np.polynomial.polynomial.polyfit(since, chosen.values, degree)
+            fit = polyfit(since, chosen.values, degree)
             return fit[0], fit[1]
     return None
 
 
 def _smooth_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
     """Return the attitude at time 0 (xyzw) and the body rate there [rad/s]."""
-    middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
+    middle = Rotation.from_quat(quats[np.abs(time).argmin()])
     turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()
-    fit = np.polynomial.polynomial.polyfit(time, turn, 2 if len(time) < 12 else 3)
+    fit = polyfit(time, turn, 2 if len(time) < 12 else 3)
     return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
 
 
@@ -274,12 +275,12 @@ def _hang(
     u = state["cable_vel_w"][0]
     link = np.full((len(n), 1), plant.rope.length / len(n))
     link[-1] += plant.rope.payload_offset
-    chord = np.sum(link * n, axis=0)
+    chord = (link * n).sum(0)
     chord /= np.linalg.norm(chord)
     turn, _ = Rotation.align_vectors(reach, chord)
     n = turn.apply(n)
     u = turn.apply(u)
-    lacking = speed - mount_vel - np.sum(link * u, axis=0)
+    lacking = speed - mount_vel - (link * u).sum(0)
     spin = cross(reach, lacking) / distance**2
     state["cable_dir_w"][0] = n
     state["cable_vel_w"][0] = u + np.cross(spin, n)
@@ -298,7 +299,7 @@ def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
     used = _charge(flight, v, power)
     volts = battery.reference_voltage
     if battery.kind == "sag":
-        open_volts = np.polynomial.polynomial.polyval(used, battery.ocv)
+        open_volts = polyval(used, battery.ocv)
         square = open_volts**2 - 4.0 * battery.resistance * power
         volts = 0.5 * (open_volts + np.sqrt(max(square, 0.0)))
     state = still(1, L)
@@ -334,4 +335,4 @@ def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
         return 0.2 if cell.kind == "sag" else 0.0
     grid = np.linspace(0.0, 1.0, 201)
     open_volts = volts + cell.resistance * power / volts
-    return np.interp(-open_volts, -np.polynomial.polynomial.polyval(grid, cell.ocv), grid)
+    return np.interp(-open_volts, -polyval(grid, cell.ocv), grid)

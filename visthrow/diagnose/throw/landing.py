@@ -14,6 +14,7 @@ from numpy import ndarray
 from numpy.linalg import norm
 
 from sim.kernels.replay.kernel import ATTACHED
+from visthrow.diagnose.models.model_interface import Sizes
 from visthrow.diagnose.throw.cutting import (
     BEFORE,
     GROUND_MARGIN,
@@ -95,7 +96,7 @@ def estimate_landing(flight: RecordedFlight, height: float) -> tuple[float, ndar
 
 
 def landings(
-    model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None
+    model: Any, theta: Sizes, flights: Iterable[int] | None = None
 ) -> PredictedLandings | None:
     """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel`
     with effects at ``theta``.
@@ -141,14 +142,14 @@ def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, f
 
 def _fly(
     model: Any,
-    theta: Mapping[str, float],
+    theta: Sizes,
     spans: Mapping[int, tuple[float, float]],
     ends: Mapping[int, float],
 ) -> ndarray:
     """Fit the states of throws over ``spans``, simulate them to ``ends``, and return the landing
     points, shape (F, 3).
     """
-    cuts: list[Cut] = []
+    cuts = []
     for n, (begin, end) in spans.items():
         cuts += _approach(model, n, begin, end)
     setting, states = model.begun(theta, cuts)
@@ -161,7 +162,7 @@ def _fly(
     measured = onward.fly(model.simulation(setting), states, lanes).samples
     points = []
     for i, c in enumerate(flown):
-        first = 2 * int(onward.windows["vehicle_count"][i])
+        first = 2 * onward.windows["vehicle_count"][i]
         time = onward.samples[i][2].time
         path = measured[first : first + len(time), i]
         free = time > looked[c.flight].latch + release.lag

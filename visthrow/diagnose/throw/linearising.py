@@ -15,7 +15,7 @@ from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import describe_knots
-from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.models.model_interface import Indices, Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
 from visthrow.diagnose.throw.replay import (
     KNOT_SPACING,
@@ -67,7 +67,7 @@ def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[
 
 def _typical_speed(vel: ndarray) -> float:
     """Return the root mean square of velocities, shape (k, 3)."""
-    return np.sqrt(np.mean(np.sum(vel**2, axis=1)))
+    return np.sqrt((vel**2).sum(1).mean())
 
 
 @dataclass(frozen=True)
@@ -122,17 +122,17 @@ class Linearisation:
             for kind in kinds
         }
 
-    def windows(self, batch: Sequence[int], channels: Sequence[ndarray]) -> list[Window]:
+    def windows(self, batch: Indices, channels: Sequence[ndarray]) -> list[Window]:
         """Linearise windows whose lanes fit into one run; ``channels``: of each window's
         samples.
         """
-        plans: list[Plan] = []
-        lanes: list[Lane] = []
+        plans = []
+        lanes = []
         first_knot = 0
         for w in batch:
             plans.append(self._plan(w, len(lanes), first_knot))
             lanes += plans[-1].lanes
-            first_knot += 2 * int(self._flights.knots[w])
+            first_knot += 2 * self._flights.knots[w]
         flown = self._flights.fly(self._simulation, self._states, lanes)
 
         def window(plan: Plan, channel: ndarray) -> Window:

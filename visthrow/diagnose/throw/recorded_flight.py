@@ -84,7 +84,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
         return None
     time, values = samples
     fresh = np.ones(len(time), dtype=bool)
-    fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is stale
+    fresh[1:] = (values[1:] != values[:-1]).any(1)  # a repeated sample is stale
     if np.count_nonzero(fresh) < 5:
         return None
     if not _is_rounded(values):
@@ -100,7 +100,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     # A rotation by a small angle changes three of a quaternion's four numbers by half of it.
     sigma = np.median(noise)
     if name == "quat_wb":
-        sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0)
+        sigma = 2.0 * np.sqrt((noise**2).sum() / 3.0)
     return ChannelSamples(time, values, max(sigma, LEAST_SIGMA[name]))
 
 
@@ -140,7 +140,7 @@ def _is_rounded(values: ndarray) -> bool:
     just after a step would remain, which are half a step ahead of the measured value."""
     changes = np.abs(np.diff(values, axis=0))
     changes = changes[changes > 0.0]
-    smallest = np.min(changes, initial=np.inf)
+    smallest = changes.min(initial=np.inf)
     return len(changes) > 0 and np.median(changes) < 1.5 * smallest
 
 

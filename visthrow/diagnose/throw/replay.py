@@ -14,6 +14,7 @@ from numpy import ndarray
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
 from sim.kernels.replay.lanes import Recording, Replay, Replayed
+from visthrow.diagnose.models.model_interface import Indices
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
@@ -45,11 +46,11 @@ STABLE = 1.75
 BATCH, CUDA_BATCH = 4096, 32768
 
 
-def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[list[int]]:
+def grouped(windows: Indices, lanes: Indices, room: int) -> list[list[int]]:
     """Split windows into runs of at most ``room`` lanes, or of one window; ``lanes``: number of
     lanes of each window.
     """
-    groups: list[list[int]] = []
+    groups = []
     spare = 0
     for w, count in zip(windows, lanes):
         if not groups or spare < count:
@@ -218,7 +219,7 @@ class ReplayedFlights:
         """Return measured minus simulated samples, shape (N,); for an attitude, the rotation vector
         from the simulated to the measured one.
         """
-        return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
+        return (self._measured[w] - measured[: self.rows[w], lane]).ravel()
 
     def fly(
         self,
@@ -271,7 +272,7 @@ class ReplayedFlights:
         first = 0
         differences = []
         for group in groups:
-            rows = int(self.rows[group[0].window])
+            rows = self.rows[group[0].window]
             last = first + len(group)
             columns = np.swapaxes(samples[:rows, first:last], 1, 2).reshape(3 * rows, -1)
             differences.append(columns[:, 1:] - columns[:, :1])
@@ -315,8 +316,8 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
     ``simulation``: of one setting."""
     (setting,) = simulation.settings
     by_flight = groupby(range(len(flights.cuts)), key=lambda w: flights.cuts[w].flight)
-    states: list[States | None] = [None] * len(flights.cuts)
-    ends: list[States | None] = [None] * len(flights.cuts)
+    states = [None] * len(flights.cuts)
+    ends = [None] * len(flights.cuts)
     columns = zip_longest(*[list(group) for _, group in by_flight])
     for k, side_by_side in enumerate(columns):
         windows = [w for w in side_by_side if w is not None]

@@ -2,8 +2,8 @@
 commands.
 """
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
@@ -16,14 +16,10 @@ from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.models.model_interface import Linearised, Model, Window
+from visthrow.diagnose.models.model_interface import Indices, Linearised, Model, Sizes, Window
 from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
-from visthrow.diagnose.throw.direct import (
-    direct_samples,
-    needs_no_flight,
-    with_direct,
-)
+from visthrow.diagnose.throw.direct import direct_samples, needs_no_flight, with_direct
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
@@ -167,11 +163,11 @@ class ThrowModel(Model):
         # columns of switches, by name, taken where each was first needed
         self._secants: dict[str, list[ndarray]] = {}
 
-    def at(self, theta: Mapping[str, float]) -> Setting:
+    def at(self, theta: Sizes) -> Setting:
         """Return the setting with effects of these sizes."""
         return apply(self.entries, self.setting, theta)
 
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
+    def windows(self, theta: Sizes) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         setting = self.at(theta)
         ways = directions(setting.plant)  # another kind of block has other states
@@ -187,7 +183,7 @@ class ThrowModel(Model):
         )
         lanes = 2 + graded + len(ways) + 9 * self.flights.knots[self._retained]
         room = BATCH if self.device == "cpu" else CUDA_BATCH
-        listed: list[Window] = []
+        listed = []
         for batch in grouped(self._retained, lanes, room):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         whole = []
@@ -196,7 +192,7 @@ class ThrowModel(Model):
             whole.append(with_direct(window, direct, self.channels, settings, steps))
         return whole
 
-    def _add_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
+    def _add_switches(self, theta: Sizes, listed: list[Window]) -> list[Window]:
         """Return the windows with columns of the switches, and zeros for effects that only cameras
         show.
         """
@@ -209,12 +205,10 @@ class ThrowModel(Model):
             columns = [secant[i][:, None] for secant in secants]
             blank = np.zeros((len(w.residual), len(self._sighted)))
             effects = np.hstack((w.effects, *columns, blank))
-            windows.append(dataclasses.replace(w, effects=effects))
+            windows.append(replace(w, effects=effects))
         return windows
 
-    def _secant(
-        self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
-    ) -> list[ndarray]:
+    def _secant(self, e: SettingEffect, theta: Sizes, windows: list[Window]) -> list[ndarray]:
         """Return the change of the samples if a block is switched, per theta; a column for each
         window.
 
@@ -237,7 +231,7 @@ class ThrowModel(Model):
         lanes = [Lane(w, 0, w) for w in self._retained]
         return self.flights.residuals(self.simulation(setting), states, lanes)
 
-    def residuals(self, theta: Mapping[str, float], linearised: Linearised) -> list[ndarray]:
+    def residuals(self, theta: Sizes, linearised: Linearised) -> list[ndarray]:
         """See :class:`.model_interface.Model`."""
         setting = self.at(theta)
         states, moves = self._following(setting, theta, linearised)
@@ -251,11 +245,11 @@ class ThrowModel(Model):
             residuals.append(residual)
         return residuals
 
-    def possible(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+    def possible(self, theta: Sizes) -> Sizes:
         """See the base class."""
         return possible_together(self.entries, self.setting, theta)
 
-    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
+    def without_commands(self, theta: Sizes, windows: Indices) -> list[ndarray]:
         """See the base class.
 
         A radio link may lose commands or deliver them late. The vehicle then keeps the previous
@@ -269,7 +263,7 @@ class ThrowModel(Model):
             f = flights.flights[c.flight]
             acting = find_acting(f.command_time, f.command, delay, c.start, c.end)
             whole = Lane(w, 0, w, rough=True)
-            skipped = (flights.first_command[c.flight] + acting).tolist()
+            skipped = flights.first_command[c.flight] + acting
             groups[w] = [whole, *[whole._replace(skip=number) for number in skipped]]
         simulation = self.simulation(self.at(theta))
         states = self._settled_at[_key(theta)]
@@ -279,7 +273,7 @@ class ThrowModel(Model):
         return columns
 
     def _following(
-        self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
+        self, setting: Setting, theta: Sizes, linearised: Linearised
     ) -> tuple[States, dict[int, ndarray]]:
         """Adjust the states to other sizes of the effects by the derivatives; return the states and
         each window's displacement from its prior mean.
@@ -299,17 +293,17 @@ class ThrowModel(Model):
 
     def step_error(self) -> dict[str, float]:
         """See the base class."""
-        fine = dataclasses.replace(self.setting, step_square=1.0 / FINER**2)
+        fine = replace(self.setting, step_square=1.0 / FINER**2)
         worst = np.zeros(len(self.channels))
         flown = (self._flown(setting, self._nominal[0]) for setting in (self.setting, fine))
         for w, plain, finer in zip(self._retained, *flown):
             change = np.abs(plain - finer) / self.flights.sigma[w]
             np.fmax.at(worst, self._channel(w), change)
-        return dict(zip(self.channels, worst.tolist()))
+        return dict(zip(self.channels, worst))
 
     landings = landings
 
-    def begun(self, theta: Mapping[str, float], cuts: Sequence[Cut]) -> tuple[Setting, States]:
+    def begun(self, theta: Sizes, cuts: Sequence[Cut]) -> tuple[Setting, States]:
         """Return the setting with effects at ``theta``, and the initial states of other windows of
         the model's flights, fitted in it.
         """
@@ -349,13 +343,13 @@ class ThrowModel(Model):
         it; ``ends``: states at the windows' ends.
         """
         cuts: list[Cut] = []
-        rings: dict[int, float] = {}  # flight -> time until which its rope may whip
+        rings = {}  # flight -> time until which its rope may whip
         for w, c in enumerate(self.flights.cuts):
-            first = float(ends["slack_first"][w])
-            last = float(ends["slack_last"][w])
+            first = ends["slack_first"][w]
+            last = ends["slack_last"][w]
             separation = self.flights.separation(w)
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
-                c = dataclasses.replace(c, after_slack=True)
+                c = replace(c, after_slack=True)
             if last < c.start:
                 cuts.append(c)
                 continue
@@ -394,7 +388,7 @@ def effects_for(
     return chosen
 
 
-def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
+def _key(theta: Sizes) -> frozenset[tuple[str, float]]:
     """Return the sizes that are not 0."""
     return frozenset((name, float(value)) for name, value in theta.items() if value)
 

@@ -15,6 +15,7 @@ from numpy import ndarray
 
 from visthrow.common.rotations import multiply, normal_part, quat_of_vector, rotate, vectors_between
 from visthrow.diagnose.models.law_terms import describe_knots
+from visthrow.diagnose.models.model_interface import Sizes
 from visthrow.diagnose.models.numeric import Lanes, Stretch, triangles
 from visthrow.diagnose.models.quadrotor.driven import DrivenModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams
@@ -127,7 +128,7 @@ class FlyerModel(DrivenModel):
             listed.append(describe_knots(values, np.unique(stretch.latent_time), mount))
         return listed
 
-    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
+    def without_commands(self, theta: Sizes, windows: Sequence[int]) -> list[ndarray]:
         """See the base class; commands that an autopilot logs of its own motors all came."""
         if self.params.input != "command":
             return []

@@ -60,7 +60,7 @@ def cut_flying(
     starts = np.arange(first + params.window, last - params.window, params.window)
     # hours are thinned before they are cut
     stride = max(1, len(starts) // (4 * params.most_windows))
-    for start in starts[::stride].tolist():
+    for start in starts[::stride]:
         if not all(covered(c, start, start + params.window) for c in driven):
             continue
         end = start + params.window
