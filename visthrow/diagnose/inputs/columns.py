@@ -61,7 +61,7 @@ def groups_of(numbers: Table) -> list[Group]:
     """Group columns by their names: whole vectors, quaternions, matrices and sets of motors, then
     single ones.
     """
-    families: dict[tuple[int, str, str, str], dict[str, str]] = defaultdict(dict)
+    families = defaultdict(dict)
     for name in numbers:
         base, unit = split_unit(name)
         if motor := PATTERNS["motor"].match(base):
@@ -91,7 +91,7 @@ def groups_of(numbers: Table) -> list[Group]:
     listed += [("", "", names) for names in _neighbours(numbers)]
     listed += [(name, unit_by_name(name), [name]) for name in numbers]
     groups = []
-    used: set[str] = set()
+    used = set()
     for stem, unit, names in listed:
         if used.isdisjoint(names):
             values = np.column_stack([numbers[name] for name in names])
@@ -136,8 +136,8 @@ def _neighbours(numbers: Table) -> list[list[str]]:
         for name, cells in numbers.items()
         if not (rises(cells) and np.array_equal(cells, np.round(cells)))
     ]
-    groups: list[list[str]] = []
-    run: list[str] = []
+    groups = []
+    run = []
     while names and all(name.startswith("column ") for name in names):
         four = np.column_stack([numbers[name] for name in names[:4]])
         if four.shape[1] == 4 and np.nanmax(np.abs(np.linalg.norm(four, axis=1) - 1.0)) < 0.05:

@@ -7,20 +7,14 @@ the derivative of a position, rates are those of the attitude, a payload keeps i
 none of them tells becomes a question."""
 
 import re
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy import ndarray
 
 from visthrow.common.errors import LogError
-from visthrow.diagnose.inputs.columns import (
-    NAMES,
-    PATTERNS,
-    groups_of,
-    moves,
-    rises,
-    unit_by_name,
-)
+from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, moves, rises, unit_by_name
 from visthrow.diagnose.inputs.recognition import Recognition
 from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, by_mass
 from visthrow.logs.check import physics, thrust_checks
@@ -113,7 +107,7 @@ def _mapping(
     """Map the columns of numbers, and say why and ask in a proposal; None without a channel."""
     channels = {}
     clocks = {}
-    unread: list[str] = []  # questions about tables of which nothing is read
+    unread = []  # questions about tables of which nothing is read
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
@@ -126,7 +120,8 @@ def _mapping(
         }
         recognition = Recognition(time, groups_of(columns), settings)
         rivals = []
-        for entry in recognition.channels():
+        for recognised in recognition.channels():
+            entry = recognised.entry
             if entry.name in channels:
                 listed = ", ".join(entry.columns)
                 rivals.append(f"'{entry.name}' is also {listed}: which one?")
@@ -134,7 +129,7 @@ def _mapping(
             clocks[topic] = clock
             first = topic == next(iter(clocks))
             channels[entry.name] = replace(entry, clock="" if first else topic)
-            proposal.why[entry.name] = recognition.why[entry.name]
+            proposal.why[entry.name] = recognised.why
         proposal.questions += recognition.questions
         if topic not in clocks:  # nothing of this table is read
             unread += proposal.questions[asked:]
@@ -150,9 +145,9 @@ def _mapping(
 
 def _tables(numbers: Table) -> dict[str, Table]:
     """Columns by the table that they are of: what stands before a colon."""
-    tables: dict[str, Table] = {}
+    tables = defaultdict(dict)
     for name, cells in numbers.items():
-        tables.setdefault(name.rpartition(":")[0], {})[name] = cells
+        tables[name.rpartition(":")[0]][name] = cells
     return tables
 
 
@@ -216,7 +211,7 @@ def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
 
 def _without_sparse(log: FlightLog) -> FlightLog:
     """Return a log without the channels that hold too little."""
-    full = {name: c for name, c in log.channels.items() if np.sum(c.valid) >= 50}
+    full = {name: c for name, c in log.channels.items() if c.valid.sum() >= 50}
     return FlightLog(full, log.meta)
 
 

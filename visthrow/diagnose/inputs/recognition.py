@@ -12,6 +12,7 @@ from visthrow.common.rotations import matrix_of_quat, rotate_back, tilt_deg
 from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, moves, rises, split_unit
 from visthrow.diagnose.inputs.unit_evidence import (
     LENGTHS,
+    NO_ATTITUDE,
     SURE,
     THRUSTS,
     Attitude,
@@ -54,6 +55,16 @@ _FRAMES = {"w": "world", "wb": "world", "b": "body", "c": "camera"}
 _MOTIONS = {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}
 
 
+@dataclass
+class Recognised:
+    """A channel, and what it was recognised by."""
+
+    entry: ChannelMap
+    channel: Channel
+    group: Group
+    why: str
+
+
 @dataclass(frozen=True)
 class Path:
     """A path in metres, z up."""
@@ -76,7 +87,6 @@ class Recognition:
 
     Attributes:
         questions: What neither names nor physics tell.
-        why: Reasons, by channel.
     """
 
     def __init__(self, time: ndarray, groups: list[Group], settings: dict[str, str]):
@@ -84,15 +94,12 @@ class Recognition:
         self.time = time
         self.settings = settings
         self.questions: list[str] = []
-        self.why: dict[str, str] = {}
         for group in groups:
             group.values = np.where(find_lost_rows(group.values)[:, None], np.nan, group.values)
         self._groups = [group for group in groups if moves(group.values)]  # that no channel has
-        self._entries: dict[str, ChannelMap] = {}
-        self._channels: dict[str, Channel] = {}
-        self._sources: dict[str, Group] = {}  # of the channels
+        self._found: dict[str, Recognised] = {}
 
-    def channels(self) -> list[ChannelMap]:
+    def channels(self) -> list[Recognised]:
         """Recognise what can be, the vehicle's attitude and path first."""
         self._quaternions()
         self._find_other_attitudes()
@@ -104,7 +111,7 @@ class Recognition:
         self._single_columns()
         self._thrust()
         self._ask_what_is_open()
-        return list(self._entries.values())
+        return list(self._found.values())
 
     def _open(self, size: int, targets: bool = False) -> list[Group]:
         """Groups of so many columns that no channel has; ``targets``: those of set-points too."""
@@ -122,10 +129,10 @@ class Recognition:
         """Make a channel of a group, unless its units contradict what the name stands for;
         ``options``: of its :class:`ChannelMap`.
         """
-        if name in self._entries:
+        if name in self._found:
             return False
         values = group.values
-        held = bool(np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5)
+        held = bool((values[1:] == values[:-1]).all(1).mean() > 0.5)
         frame = "" if name in STANDARD_CHANNELS else _FRAMES.get(name.rpartition("_")[2], "")
         entry = ChannelMap(name, group.columns, unit, frame=frame, held=held, **options)
         try:
@@ -133,10 +140,8 @@ class Recognition:
         except (ConfigError, LogError):
             return False
         self._groups.remove(group)
-        self._entries[name] = entry
-        self._channels[name] = channel
-        self._sources[name] = group
-        self.why[name] = why + ("; its values are held between measurements" if held else "")
+        why += "; its values are held between measurements" if held else ""
+        self._found[name] = Recognised(entry, channel, group, why)
         return True
 
     def _quaternions(self) -> None:
@@ -147,9 +152,9 @@ class Recognition:
             name = "quat_wb"
             if group.matches("not_vehicle"):
                 name = "marker_quat_c" if group.matches("camera") else "payload_quat_wb"
-            elif name in self._entries and group.matches("estimate"):
+            elif name in self._found and group.matches("estimate"):
                 name = "est_quat_wb"
-            largest = np.argmax(np.nanmean(np.abs(group.values), axis=0))
+            largest = np.nanmean(np.abs(group.values), 0).argmax()
             order = "xyzw" if _has_letters(group) or largest == 3 else "wxyz"
             why = "four columns of length 1"
             self._take(name, group, "1", why, kind="quaternion", order=order)
@@ -173,12 +178,12 @@ class Recognition:
                     ' pitch and yaw (kind = "euler")?'
                 )
 
-    def _attitudes(self) -> list[Attitude | None]:
-        """All ways to read the columns of the vehicle's attitude, None where it has none."""
-        if "quat_wb" not in self._entries:
-            return [None]
-        entry = self._entries["quat_wb"]
-        group = self._sources["quat_wb"]
+    def _attitudes(self) -> list[Attitude]:
+        """All ways to read the columns of the vehicle's attitude."""
+        if "quat_wb" not in self._found:
+            return [NO_ATTITUDE]
+        entry = self._found["quat_wb"].entry
+        group = self._found["quat_wb"].group
         motive = "Format Version" in self.settings
         open_unit = entry.kind == "euler" and not group.unit and entry.unit == "rad"
         open_order = entry.kind == "quaternion" and not _has_letters(group)
@@ -192,7 +197,7 @@ class Recognition:
             negated = group.values * [1.0, -1.0, 1.0]
             readings_of_columns.append(((roll, f"-{pitch}", yaw), negated, ""))
             named_nose_up = bool(PATTERNS["nose_up"].search(pitch))
-        ways: list[Attitude | None] = []
+        ways = []
         for unit, order, reading in product(units, orders, readings_of_columns):
             columns, values, axes = reading
             tried = replace(
@@ -221,7 +226,7 @@ class Recognition:
             force_b = self._samples(group)
             turn = matrix_of_quat(attitudes.attitudes(force_b.time))
             force_w = turn @ (force_b.values @ turn_to(axes))[..., None]
-            if tilt_deg(np.mean(force_w, axis=0)[:, 0]) < physics.TURNED:
+            if tilt_deg(force_w.mean(0)[:, 0]) < physics.TURNED:
                 return False
         return bool(groups)
 
@@ -236,7 +241,7 @@ class Recognition:
         slopes = groups + [g for g in smooth if g.hints_at("velocity")]
         groups = self._drop_derivatives(groups, slopes)
         for group in [g for g in groups if g.matches("camera")]:
-            unit = readings(self.time, group.values, _lengths(group), [None])[0].unit
+            unit = readings(self.time, group.values, _lengths(group), [NO_ATTITUDE])[0].unit
             why = "three columns that move smoothly; their name speaks of a camera"
             self._take("marker_pos_c", group, unit, why)
         paths = self._paths([g for g in groups if not g.matches("camera")])
@@ -248,13 +253,10 @@ class Recognition:
         if pay is not None and upper is not None and not upper.group.matches("estimate"):
             paths.sort(key=lambda path: path is not upper)  # the payload hangs below it
         for path in paths:
-            names = ["pos_w"] if path is paths[0] else []
-            names.append(path.usual_name)
             wide = np.nanmax(np.nanstd(path.group.values, axis=0))
             smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd)"
-            for name in names:
-                if self._take_path(name, path, smoothly):
-                    break
+            if not self._take_path("pos_w", path, smoothly):
+                self._take_path(path.usual_name, path, smoothly)
         if len(paths) > 1:
             listed = "; ".join(path.group.listed for path in paths)
             self.questions.append(
@@ -270,7 +272,7 @@ class Recognition:
 
     def _up(self) -> str:
         """Axes of the world, as the attitude has them."""
-        return self._entries["quat_wb"].axes if "quat_wb" in self._entries else ""
+        return self._found["quat_wb"].entry.axes if "quat_wb" in self._found else ""
 
     def _body(self) -> str:
         """Axes of what is measured on board: an autopilot's, where its attitude has them."""
@@ -282,9 +284,9 @@ class Recognition:
         """
         attitudes = self._attitudes()
         ranked = [readings(self.time, group.values, _lengths(group), attitudes) for group in groups]
-        alone = [PathReading("", way, way.doubt, "") for way in attitudes if way is not None]
+        alone = [PathReading("", way, way.doubt, "") for way in attitudes]
         deciding = min(ranked, key=lambda listed: listed[0].doubt, default=alone)
-        if alone:
+        if "quat_wb" in self._found:
             self._settle_attitude(sorted(deciding, key=lambda reading: reading.doubt))
         paths = []
         for group, listed in zip(groups, ranked):
@@ -298,21 +300,25 @@ class Recognition:
                     f"{group.listed} reach {reach:.3g} from the origin: {best.words} is a guess;"
                     f" {' and '.join(rivals)} would do as well"
                 )
-            pos_w = UNITS[best.unit][1] * group.values @ turn_to(self._up())
-            paths.append(Path(group, best.unit, pos_w, "" if group.unit else f"; {best.why}"))
+            paths.append(self._path(group, best.unit, "" if group.unit else f"; {best.why}"))
         return paths
+
+    def _path(self, group: Group, unit: str, why: str = "") -> Path:
+        """Return the path that a group's columns are in a unit."""
+        return Path(group, unit, UNITS[unit][1] * group.values @ turn_to(self._up()), why)
 
     def _settle_attitude(self, ranked: list[PathReading]) -> None:
         """Take the likeliest way to read the attitude; ask where no path says which one is."""
         best, *others = ranked
         rivals = [r for r in others if r.attitude is not best.attitude]
-        self._entries["quat_wb"] = best.attitude.entry
-        self._channels["quat_wb"] = best.attitude.channel
+        recognised = self._found["quat_wb"]
+        recognised.entry = best.attitude.entry
+        recognised.channel = best.attitude.channel
         if not rivals:
             return
         nats = rivals[0].doubt - best.doubt
         if nats >= SURE:
-            self.why["quat_wb"] += f"; {best.attitude.words} by gravity, {nats:.0f} nats"
+            recognised.why += f"; {best.attitude.words} by gravity, {nats:.0f} nats"
         elif not best.unit:
             listed = " and ".join(r.attitude.words for r in rivals)
             self.questions.append(
@@ -328,15 +334,9 @@ class Recognition:
         """
         best = None
         rows = slice(None, None, max(1, len(self.time) // _COMPARED))
-        known = {path.group.columns for path in paths}
+        nameless = [group for group in unnamed if group not in [path.group for path in paths]]
         for upper in paths:
-            size = UNITS[upper.unit][1]
-            nameless = [
-                Path(group, upper.unit, size * group.values @ turn_to(self._up()), "")
-                for group in unnamed
-                if group.columns not in known
-            ]
-            for lower in paths + nameless:
+            for lower in paths + [self._path(group, upper.unit) for group in nameless]:
                 gap = lower.pos_w[rows] - upper.pos_w[rows]
                 length = np.linalg.norm(gap, axis=1)
                 middle = np.nanmedian(length)
@@ -352,12 +352,12 @@ class Recognition:
         return None
 
     def _smooth(self, group: Group) -> bool:
-        values = group.values[np.all(np.isfinite(group.values), axis=1)]
+        values = group.values[np.isfinite(group.values).all(1)]
         if len(values) < 50:
             return False
-        width = np.max(np.std(values, axis=0))
-        step = np.max(np.std(np.diff(values, axis=0), axis=0))
-        return bool(width > 0.0 and step < 0.3 * width)
+        width = values.std(0).max()
+        step = np.diff(values, axis=0).std(0).max()
+        return bool(step < 0.3 * width)
 
     def _drop_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
         """Return the groups that are no derivative of another path; of captures with many markers
@@ -366,9 +366,9 @@ class Recognition:
         grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
         if not groups or len(grid) < 25:
             return groups
-        laid = {g.columns: _interpolate(self._samples(g), grid) for g in groups + paths}
-        slopes = [_normalise(np.gradient(laid[path.columns], axis=0)) for path in paths]
-        values = [_normalise(laid[group.columns]) for group in groups]
+        laid = {g: _interpolate(self._samples(g), grid) for g in groups + paths}
+        slopes = [_normalise(np.gradient(laid[path], axis=0)) for path in paths]
+        values = [_normalise(laid[group]) for group in groups]
         firm = np.array(slopes) @ np.array(values).T > _FIRMLY
         return [
             group
@@ -396,16 +396,17 @@ class Recognition:
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
-            if name not in self._entries:
+            if name not in self._found:
                 continue
-            slope = self._samples(self._sources[name]).derivative(_SPAN)
+            path = self._found[name]
+            slope = self._samples(path.group).derivative(_SPAN)
             best = self._best(slope, [g for g in self._open(3) if g.unit not in LENGTHS])
             in_world = best[0].correlation if best else 0.0
             turned = name == "pos_w" and self._body_velocity(in_world)
             if turned or best is None:
                 continue
             relation, group = best
-            ratio = relation.scale / UNITS[self._entries[name].unit][1]
+            ratio = relation.scale / UNITS[path.entry.unit][1]
             unit, _ = nearest_unit(ratio, ("m/s", "cm/s", "mm/s"))
             why = f"the derivative of {name}, correlation {relation.correlation:.2f},"
             why += f" {relation.scale:.3g} of its unit a second"
@@ -415,10 +416,10 @@ class Recognition:
         """Take a velocity that is the path's in the body's axes rather than in the world's, where
         it goes together with the path by a correlation.
         """
-        if "quat_wb" not in self._entries:
+        if "quat_wb" not in self._found:
             return False
-        time, slope = self._channels["pos_w"].samples().derivative(_SPAN)
-        attitude = self._channels["quat_wb"].samples()
+        time, slope = self._found["pos_w"].channel.samples().derivative(_SPAN)
+        attitude = self._found["quat_wb"].channel.samples()
         turned = Samples(time, rotate_back(attitude.attitudes(time), slope))
         best = self._best(turned, self._hinting("velocity"))
         if best is None:
@@ -434,25 +435,22 @@ class Recognition:
         return self._take("vel_b", group, unit, why)
 
     def _rates(self) -> None:
-        derived = Samples(np.empty(0), np.empty((0, 3)))
-        if "quat_wb" in self._entries:
-            derived = self._channels["quat_wb"].samples().rates()
-        best = None
-        for group in self._hinting("rate_b"):
-            values = self._samples(group)
-            relation = relations.relate(derived, values, reach=_REACH)
-            score = relation.axes_correlation if relation is not None else 0.0
-            if best is None or score > best[0]:
-                best = score, group, values
-        if best is None:
+        groups = self._hinting("rate_b")
+        if not groups:
             return
-        score, group, values = best
+        derived = Samples(np.empty(0), np.empty((0, 3)))
+        if "quat_wb" in self._found:
+            derived = self._found["quat_wb"].channel.samples().rates()
+        related = [relations.relate(derived, self._samples(g), reach=_REACH) for g in groups]
+        scores = [0.0 if r is None else r.axes_correlation for r in related]
+        score = max(scores)
+        group = groups[scores.index(score)]
         why = f"99 % within {group.reach:.3g}"
         guess = "deg/s" if group.reach > 30.0 else "rad/s"
         unit = NAMES["usual_units"].get(group.columns[0], guess)
         unit = group.unit if group.unit.endswith("/s") else unit
         if score > _BELONGS:
-            times = _size(values) / max(_size(derived), 1e-6)
+            times = _size(self._samples(group)) / max(_size(derived), 1e-6)
             unit = "deg/s" if times > 7.0 else "rad/s"
             why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
         elif not group.unit:
@@ -504,7 +502,7 @@ class Recognition:
                 for unit in fitting_units(group.middle, units, *_PACK):
                     why = f"a middle of {group.middle:.4g}: a pack in {unit}"
                     self._take("battery_voltage", group, unit, why)
-            elif group.matches("angle") and "quat_wb" not in self._entries:
+            elif group.matches("angle") and "quat_wb" not in self._found:
                 unit = _angle_unit(group)
                 why = f"an angle, by its name; a middle of {group.middle:.3g}"
                 if self._take("angle", group, unit, why) and not group.unit:
@@ -527,7 +525,7 @@ class Recognition:
                 self._take("thrust_command", group, unit, f"a middle of {group.middle:.4g}")
 
     def _ask_what_is_open(self) -> None:
-        known = self._entries.keys()
+        known = self._found.keys()
         columns = [column for group in self._groups for column in group.columns]
         outputs = [c for c in columns if PATTERNS["motor"].match(split_unit(c)[0])]
         if len(outputs) > 4 and not known & {"motor_command", "motor_speed"}:
@@ -535,11 +533,11 @@ class Recognition:
                 f"which four of {', '.join(outputs)} are the motors? None is taken"
             )
         if "quat_wb" in known and not known & {"pos_w", "rate_b"}:
-            group = self._sources["quat_wb"]
-            if self._entries["quat_wb"].kind == "euler" and not group.unit:
+            attitude = self._found["quat_wb"]
+            if attitude.entry.kind == "euler" and not attitude.group.unit:
                 self.questions.append(
-                    f"are {group.listed} angles, as taken, or body rates? Nothing in the motion"
-                    " says"
+                    f"are {attitude.group.listed} angles, as taken, or body rates? Nothing in the"
+                    " motion says"
                 )
         if "pos_w" in known and not known & _MOTIONS:
             self.questions.append(
@@ -573,7 +571,7 @@ def _has_letters(group: Group) -> bool:
 
 def _normalise(values: ndarray) -> ndarray:
     """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
-    centred = (values - np.mean(values, axis=0)).ravel()
+    centred = (values - values.mean(0)).ravel()
     return centred / max(np.linalg.norm(centred), 1e-300)
 
 
@@ -586,4 +584,4 @@ def _interpolate(samples: Samples, grid: ndarray) -> ndarray:
 
 def _size(samples: Samples) -> float:
     """Root mean square about the means of the columns."""
-    return np.sqrt(np.mean(np.var(samples.values, axis=0)))
+    return np.sqrt(samples.values.var(0).mean())

@@ -2,10 +2,11 @@
 thrust carries.
 """
 
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -58,7 +59,7 @@ class Attitude:
     entry: ChannelMap
     channel: Channel
     doubt: float  # nats against it before any path is looked at
-    words: str = ""  # by which it differs from the other ways
+    words: str = ""  # by which it differs from the other ways; "" where there is only one
 
     @property
     def kind(self) -> tuple[str, str, tuple[str, ...]]:
@@ -66,19 +67,24 @@ class Attitude:
         return self.entry.order, self.entry.axes, self.entry.columns
 
 
+_NEVER = Channel(np.empty(0), np.empty((0, 4)), "1")
+NO_ATTITUDE = Attitude(ChannelMap("none", ("none",), "1"), _NEVER, doubt=0.0)
+"""Of a vehicle none of whose columns is an attitude."""
+
+
 @dataclass(frozen=True)
 class PathReading:
     """One way to read the columns of a path, beside an attitude."""
 
     unit: str
-    attitude: Attitude | None
+    attitude: Attitude
     doubt: float  # nats against it, less those of other readings of the same path
     why: str
 
     @property
     def words(self) -> str:
         """Unit, and the attitude's reading where there are several."""
-        way = self.attitude.words if self.attitude is not None else ""
+        way = self.attitude.words
         return f"'{self.unit}'" + (f" with {way}" if way else "")
 
 
@@ -95,7 +101,7 @@ NO_LEAN = Lean(0.0, 0.0, 0.0, 0.0)
 
 
 def readings(
-    time: ndarray, path: ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
+    time: ndarray, path: ndarray, units: Iterable[str], attitudes: Iterable[Attitude]
 ) -> list[PathReading]:
     """Weigh all readings of a path, the likeliest first.
 
@@ -106,17 +112,15 @@ def readings(
         time: Stamps of the path [s], shape (T,).
         path: The path in its unknown unit, shape (T, 3).
         units: Units of length that are tried.
-        attitudes: Readings of the vehicle's attitude; None where there is no attitude.
+        attitudes: Readings of the vehicle's attitude.
     """
     reach = np.nanmax(np.abs(path))
     in_hall = fitting_units(reach, units, *_HALL)
     fall = by_fall(time, path)
-    attitudes = list(attitudes)
-    leans = [NO_LEAN if way is None else _weigh_by_lean(time, path, way) for way in attitudes]
-    together: dict[Any, float] = {}  # by kind: angles in whatever unit
-    kinds = [way.kind if way is not None else None for way in attitudes]
-    for kind, lean in zip(kinds, leans):
-        together[kind] = max(together.get(kind, 0.0), lean.nats)
+    leans = [_weigh_by_lean(time, path, way) for way in attitudes]
+    together = defaultdict(float)  # by kind: angles in whatever unit
+    for attitude, lean in zip(attitudes, leans):
+        together[attitude.kind] = max(together[attitude.kind], lean.nats)
     decades = []  # of what a lean makes, by which a unit is off
     for lean, unit in product(leans, units):
         if lean.times > 0.0:
@@ -126,17 +130,15 @@ def readings(
     leaning = leaning and correlation > 0.0
     slack = -np.log(correlation) if leaning else 0.0  # by which noise of either changes their ratio
     listed = []
-    for attitude, kind, lean in zip(attitudes, kinds, leans):
-        below = 0.0
-        if attitude is not None:
-            height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
-            below = attitude.doubt + _BELOW * (height < 0.0)
+    for attitude, lean in zip(attitudes, leans):
+        height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
+        below = _BELOW * (height < 0.0)
         for unit in units:
-            doubt = below + _OUTSIDE * (unit not in in_hall)
+            doubt = attitude.doubt + below + _OUTSIDE * (unit not in in_hall)
             doubt += _OUTSIDE * (fall not in ("", unit))
             why = f"{unit} by the size of a hall: {reach:.3g} from the origin"
             if leaning:
-                doubt -= together[kind]
+                doubt -= together[attitude.kind]
             if leaning and lean.times > 0.0:
                 times = UNITS[unit][1] * lean.times
                 doubt += _huber(max(0.0, abs(np.log(times)) - slack) / _SCATTER)
@@ -156,8 +158,8 @@ def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
         return NO_LEAN
     up = matrix_of_quat(attitudes.attitudes(stamps))[:, :, 2]
     lean = Samples(stamps, GRAVITY * up[:, :2]).mean_over(stamps, _SPAN)
-    lean = (lean - np.mean(lean, axis=0)).ravel()
-    moved = (acc[:, :2] - np.mean(acc[:, :2], axis=0)).ravel()
+    lean = (lean - lean.mean(0)).ravel()
+    moved = (acc - acc.mean(0))[:, :2].ravel()
     power = np.linalg.norm(lean) * np.linalg.norm(moved)
     if power <= 0.0:
         return NO_LEAN
@@ -190,7 +192,7 @@ def by_fall(time: ndarray, path: ndarray) -> str:
     shares = {}
     for unit in LENGTHS:
         off = np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2)
-        shares[unit] = np.max(np.mean(off < _FALLS * GRAVITY, axis=0))
+        shares[unit] = (off < _FALLS * GRAVITY).mean(0).max()
     best = max(shares, key=shares.__getitem__)
     return best if shares[best] > _SHARE else ""
 
@@ -213,5 +215,5 @@ def by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
 
 def rising(time: ndarray, path: ndarray) -> Samples:
     """Rows that are numbers and leave the clock going on."""
-    rows = forward_rows(np.where(np.all(np.isfinite(path), axis=1), time, np.nan))
+    rows = forward_rows(np.where(np.isfinite(path).all(1), time, np.nan))
     return Samples(time[rows], path[rows])
