@@ -89,7 +89,7 @@ class Limits:
             return 1.0
 
         def excess(share: float) -> float:
-            return np.max(_extremes(path + share * added) - self._most) - 0.5 * ROUNDING
+            return (_extremes(path + share * added) - self._most).max() - 0.5 * ROUNDING
 
         return brentq(excess, 0.0, 1.0)
 
@@ -167,7 +167,7 @@ START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the ma
 
 def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
     """Lay the sweeps of a vector of :data:`NUMBERS` over a manoeuvre."""
-    x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0).tolist()))
+    x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0)))
     kept = x["kept"]
     seconds = base.seconds - 2.0 * SETTLE
     t = moving_times(base.seconds)
@@ -208,24 +208,17 @@ def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
     )
 
 
-@dataclass
+@dataclass(frozen=True)
 class Design:
-    """A search for the sweeps over a manoeuvre, and the best that can be flown."""
+    """The best sweeps over a manoeuvre that a search found."""
 
-    aim: PlanningGoal
     base: Manoeuvre
-    simulate: Simulate
-    limits: Limits
-    numbers: ndarray | None = None  # of the best; None where none can be flown
-    information: ndarray | None = None  # of the best
-    rate: float = -np.inf  # expected nats a second of the best
-    start: float = np.nan  # the same of the manoeuvre that it began with
-    flights: int = 0  # simulated
-
-    @property
-    def manoeuvre(self) -> Manoeuvre:
-        """The best manoeuvre."""
-        return designed(self.base, self.limits, self.numbers)
+    manoeuvre: Manoeuvre
+    numbers: ndarray  # values of :data:`NUMBERS`
+    information: ndarray  # expected from the manoeuvre, see :meth:`PlanningGoal.information`
+    rate: float  # expected nats a second
+    start: float  # the same of ``base``
+    flights: int  # number of simulated flights
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -235,29 +228,19 @@ class Design:
             "nats_a_second": self.rate,
             "of_the_base": self.start,
             "flights": self.flights,
-            "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
+            "numbers": dict(zip(NUMBERS, self.numbers)),
         }
 
-    def costs(self, columns: ndarray) -> ndarray:
-        """Less for more expected nats a second; of what would be aborted, more than of all others
-        and the more the nearer to a crash.
 
-        ``columns``: designs, shape (numbers, n).
-        """
-        self.flights += columns.shape[1]
-        simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])
-        return np.array([self._cost(x, s) for x, s in zip(columns.T, simulated)])
+def _judge(aim: PlanningGoal, simulated: Simulated, seconds: float) -> tuple[float, ndarray | None]:
+    """Return the cost of a flight, and the information expected from it; None if it is aborted.
 
-    def _cost(self, x: ndarray, simulated: Simulated) -> float:
-        if simulated.model is None:
-            return ABORTED * simulated.used
-        information = self.aim.information(simulated.model)
-        rate = self.aim.nats(information) / self.base.seconds
-        if rate > self.rate:
-            self.rate = rate
-            self.numbers = x.copy()
-            self.information = information
-        return -rate
+    The cost falls with the expected nats a second. An aborted flight costs more than all others,
+    and the more the closer it comes to a crash."""
+    if simulated.model is None:
+        return ABORTED * simulated.used, None
+    information = aim.information(simulated.model)
+    return -aim.nats(information) / seconds, information
 
 
 def optimise(
@@ -278,18 +261,22 @@ def optimise(
     count = len(NUMBERS)
     points = qmc.Sobol(count, seed=seed).random(SCATTERED)
     scattered = START + SCATTER_SHARE * (points - START)
-    design = Design(aim, base, simulate, limits)
-    design.start = -design.costs(START[:, None])[0]
+    tried = []  # cost and information of each simulated flight
 
-    def generation(columns: ndarray) -> ndarray:
-        costs = design.costs(columns)
-        flown = design.numbers is not None
-        best = f"{design.rate:.3g} nats a second" if flown else "nothing that can be flown"
-        progress(f"{design.flights} simulated flights: {best}")
-        return costs
+    def best() -> tuple[float, ndarray | None]:
+        return min(tried, key=lambda trial: trial[0])
 
-    differential_evolution(
-        generation,
+    def costs(columns: ndarray) -> ndarray:
+        simulated = simulate([designed(base, limits, x) for x in columns.T])
+        tried.extend(_judge(aim, flight, base.seconds) for flight in simulated)
+        cost, information = best()
+        flown = information is not None
+        text = f"{-cost:.3g} nats a second" if flown else "nothing that can be flown"
+        progress(f"{len(tried)} simulated flights: {text}")
+        return np.array([cost for cost, _ in tried[-len(simulated) :]])
+
+    found = differential_evolution(
+        costs,
         [(0.0, 1.0)] * count,
         init=np.vstack((START, scattered)),
         maxiter=steps,
@@ -301,4 +288,8 @@ def optimise(
         polish=False,
         seed=seed,
     )
-    return None if design.numbers is None else design
+    cost, information = best()
+    if information is None:
+        return None
+    manoeuvre = designed(base, limits, found.x)
+    return Design(base, manoeuvre, found.x, information, -cost, -tried[0][0], len(tried))

@@ -25,7 +25,7 @@ from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, ChannelSpec, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import load_experiment, plant_of
 from visthrow.throws.plants import fly_payloads
@@ -54,22 +54,8 @@ ROWS = ("pos_w", "yaw", "rates_b", "thrust_factor", "release")
 """What is flown of a manoeuvre."""
 STEPS = round(PERIOD / SAMPLE_PERIOD)  # samples in a row of a reference
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
-LOGGED = {
-    "pos_w": ("m", "world"),
-    "quat_wb": ("1", "world"),
-    "payload_pos_w": ("m", "world"),
-    "rate_b": ("rad/s", "body"),
-    "acc_b": ("m/s^2", "body"),
-    "battery_voltage": ("V",),
-    "command": ("N, rad/s", "body"),
-    "release_command": ("1",),
-    "thrust_command": ("N",),
-    "throttle": ("1",),
-    "motor_command": ("1",),
-    "motor_output": ("1",),
-    "motor_speed": ("rad/s",),
-}
-"""Channel of a simulated log -> unit and frame."""
+FREE = ChannelSpec("", "none", (), "in the unit in which the model reads it")
+"""A channel of no standard name."""
 
 
 @dataclass(frozen=True)
@@ -235,9 +221,9 @@ class SimulatedFlight:
         planned = self.manoeuvre.pos_w
         off = self.truth["pos_w"][::STEPS] - planned
         height = planned[:, 2] - self.manoeuvre.lowest
-        sunk = np.max(-off[:, 2] / height)
+        sunk = (-off[:, 2] / height).max()
         distance = np.linalg.norm(off, axis=1)
-        astray = np.max(distance) / ASTRAY
+        astray = distance.max() / ASTRAY
         swing = self.swing / HIGHEST
         used = np.max([swing, astray, sunk])  # NaN counts
         return min(used, LOST) if np.isfinite(used) else LOST
@@ -311,8 +297,12 @@ class SimulatedFlight:
 
 
 def _channels(time: ndarray, values: Mapping[str, ndarray]) -> dict[str, Channel]:
-    """Return channels of names in :data:`LOGGED` that share their stamps [s]."""
-    return {name: Channel(time, array, *LOGGED[name]) for name, array in values.items()}
+    """Return channels that share their stamps [s]."""
+    channels = {}
+    for name, array in values.items():
+        spec = STANDARD_CHANNELS.get(name, FREE)
+        channels[name] = Channel(time, array, spec.unit, spec.frame)
+    return channels
 
 
 def fly(

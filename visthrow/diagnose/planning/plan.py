@@ -5,6 +5,7 @@ Each manoeuvre is simulated with the model as found; its expected information, o
 measurement on the ground, is added to that at hand. For two members of a class the promise is the
 expected gap of their evidence with either as the truth, the smaller of both."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -87,7 +88,7 @@ class PlanningGoal:
         """
         theta = self.diagnosis.theta
         noise = self.base.noise
-        flown = {e.name: i for i, e in enumerate(model.effects)}
+        flown = [e.name for e in model.effects]
         windows = model.windows({name: size for name, size in theta.items() if name in flown})
         floors = np.array([e.floor for e in model.effects])
         channels = len(model.channels)
@@ -102,11 +103,8 @@ class PlanningGoal:
         flown_theta = np.zeros(len(floors))
         information = Integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
         # both catalogues name the same effects, each in floors of its own
-        places = np.zeros((len(self.names), len(floors)))
-        for i, name in enumerate(self.names):
-            if name in flown:
-                j = flown[name]
-                places[i, j] = self.priors.floor[i] / floors[j]
+        same = np.array(self.names)[:, None] == flown
+        places = same * self.priors.floor[:, None] / floors
         return places @ information @ places.T
 
     def nats(self, new: ndarray) -> float:
@@ -115,13 +113,13 @@ class PlanningGoal:
         """
         if self.pairs:
             return min(self._gap(pair, new) for pair in self.pairs)
-        return np.mean(np.log(self._deviations(0.0 * new) / self._deviations(new)))
+        return np.log(self._deviations(0.0 * new) / self._deviations(new)).mean()
 
     def settled(self, new: ndarray) -> tuple[list[tuple[int, ...]], int]:
         """Pairs apart, or effects that can be named, after the fewest flights that settle the most;
         and the number of these.
         """
-        most: list[tuple[int, ...]] = []
+        most = []
         repeats = 0
         for count in range(1, MOST_REPEATS + 1):
             settled = self._settled_by(new, count)
@@ -144,7 +142,7 @@ class PlanningGoal:
         flown = np.tile(new[self.vague, self.vague], (count, 1))
         promised = 0.5 * np.vstack((at_hand, flown)) * self.priors.slab[self.vague] ** 2
         confirmed = count_telling(promised) >= FEWEST
-        return [(j,) for j in np.compress(unknown & known & confirmed, self.vague).tolist()]
+        return [(j,) for j in np.compress(unknown & known & confirmed, self.vague)]
 
     def _gap(self, pair: tuple[int, int], new: ndarray) -> float:
         """Expected nats between two members after the new flight, with either as the truth; the
@@ -245,9 +243,9 @@ def _expect_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], floa
     """Return the latent forces of each block in each phase: where none were flown, those of the
     block's roughest phase.
     """
-    loudest: dict[int, float] = {}
+    loudest = defaultdict(float)
     for (block, _), level in noise.latent_sd.items():
-        loudest[block] = max(level, loudest.get(block, 0.0))
+        loudest[block] = max(level, loudest[block])
     # of a payload that has not been flown: as strongly as the vehicle [N]
     default = loudest.get(0, 1.0)
     levels = {}
