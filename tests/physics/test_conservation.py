@@ -109,5 +109,5 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
         )
     without, rubbed, lawful = ends
     moved = np.abs(rubbed - without)
-    assert np.all(moved.reshape(3, 3).max(axis=1) > MOVED)
+    assert np.all(moved.reshape(3, 3).max(1) > MOVED)
     assert np.abs(lawful - rubbed).max() < HELD * moved.max()

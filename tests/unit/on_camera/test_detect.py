@@ -102,7 +102,7 @@ def relight(image):
 def cover(image):
     """Draw a bar across the ball, a third as wide as the ball."""
     box = CAMERA.fisheye.denormalize(keypoints(CAMERA, POS, ROT, GOAL, BALL)[0][0, 4:]).numpy()
-    middle, radius = box.mean(axis=0), 0.5 * (box[2, 0] - box[0, 0])
+    middle, radius = box.mean(0), 0.5 * (box[2, 0] - box[0, 0])
     ends = [middle + side * 2.0 * radius * np.array([0.6, 0.8]) for side in (-1.0, 1.0)]
     ends = [tuple(end.round().astype(int).tolist()) for end in ends]
     return cv2.line(image.copy(), *ends, (33, 31, 31), round(radius / 1.5))

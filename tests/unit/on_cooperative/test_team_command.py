@@ -30,7 +30,7 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
     landing_height = experiment.release.landing_height
     assert track.flight_w[-1, 2] == approx(landing_height, abs=1e-3)
     assert np.diff(np.append(track.time, track.flight_time)).min() > 0.0
-    centres = track.frames_w.mean(axis=(2, 3))
+    centres = track.frames_w.mean((2, 3))
     np.testing.assert_allclose(centres, track.pos_w, atol=1e-6)
 
 

@@ -222,7 +222,9 @@ def test_two_causes_that_may_be_two_others_are_reported():
 
 def test_several_forms_at_once_are_another_form(monkeypatch):
     """Two effects that differ from flight to flight at once: neither is the cause."""
-    form = candidates.Scatter("", "", "", "rope", "N", (), True, 1.0, 0.5, 1.5, 0.1, 20.0, 8)
+    numbers = dict.fromkeys(("size", "low", "high", "nats", "flights"), 8.0)
+    effect = "", "", "", (), "N", "rope", 1.0, 0.1, ""
+    form = candidates.Scatter(*effect, found=True, **numbers)
     forms = tuple(replace(form, name=f"effect_{i:02d}_by_flight") for i in (1, 4))
     overall = []
     for count in (1, 2):

@@ -89,7 +89,7 @@ def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
     (log,) = logs_of(table, proposal.mapping, "a.csv")
     for name in drawn:
         assert log[name].values == approx(columns[name], rel=1e-6, abs=1e-6)
-    assert np.abs(np.sum(log["quat_wb"].values * columns["quat_wb"], axis=1)) == approx(1.0)
+    assert np.abs((log["quat_wb"].values * columns["quat_wb"]).sum(1)) == approx(1.0)
     assert np.ptp(log["pos_w"].time) == approx(np.ptp(columns["time"]))
 
 
@@ -287,7 +287,7 @@ def test_a_pitch_that_counts_up_with_the_nose_is_negated_and_read_back():
     assert proposal.mapping.entry("quat_wb").columns == (names[0], f"-{names[1]}", names[2])
     assert not proposal.left_out
     quat = logs_of(table, proposal.mapping, "a.csv")[0]["quat_wb"].values
-    assert np.abs(np.sum(quat * columns["quat_wb"], axis=1)) == approx(1.0)
+    assert np.abs((quat * columns["quat_wb"]).sum(1)) == approx(1.0)
     other = flight(20.0, seed=4, scale=0.1)["pos_w"] - [0.0, 0.0, 2.9]
     assert asks(propose(table | named("pos", 1e2 * other), "a.csv"), "'m' with axes")
 
@@ -515,7 +515,7 @@ def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
 def model_thrust(log: FlightLog, proposal) -> np.ndarray:
     """Thrust of four motors by a proposed model [N], shape (T,)."""
     inputs = log[proposal.flyer["input"]].values
-    return np.polynomial.polynomial.polyval(inputs, proposal.flyer["thrust_map"]).sum(axis=1)
+    return np.polynomial.polynomial.polyval(inputs, proposal.flyer["thrust_map"]).sum(1)
 
 
 def test_outputs_without_a_motor_are_left_out_and_a_flaps_output_becomes_a_question():

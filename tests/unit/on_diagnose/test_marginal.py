@@ -143,7 +143,7 @@ def bad_window(fitted):
 def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window):
     levels, (bad, again, _) = fitted[3], bad_window
     assert (again.share[bad, [0, 2]] > 4.0).all()
-    assert (np.delete(again.share, bad, axis=0) < 2.0).all()
+    assert (np.delete(again.share, bad, 0) < 2.0).all()
     assert again.latent_sd[0, "throw"] < 2.0 * levels.latent_sd[0, "throw"]
 
 

@@ -109,14 +109,11 @@ def test_what_is_drawn_anew_each_day_drifts():
 
 def test_a_drift_is_reported_with_its_size_and_its_days():
     drift = Scatter(
-        "lag_jitter",
-        "The lag varies",
-        "",
-        "release",
-        "s",
-        ("release_lag",),
-        True,
-        *(0.01, 0.005, 0.02, 0.001),
+        *("lag_jitter", "The lag varies", "", ("release_lag",), "s", "release", 0.1, 0.001, ""),
+        found=True,
+        size=0.01,
+        low=0.005,
+        high=0.02,
         nats=7.0,
         flights=5,
         by=DAY,

@@ -371,7 +371,7 @@ def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds(
     assert few < many
     information, priors, least = _information(40), _priors(40), _threshold(40)
     draws = evidence.null_draws(information, 2000, rng)
-    best = evidence.Posterior(information, draws, priors).additions(()).max(axis=1)
+    best = evidence.Posterior(information, draws, priors).additions(()).max(1)
     assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
 
 

@@ -54,7 +54,7 @@ def hover(folder, hidden: str) -> tuple[np.ndarray, np.ndarray]:
     assert run_command(f"diagnose simulate hover {world} --seed 3 --out {folder}") == 0
     channels = FlightLog.load(folder / "hover-3.npz").channels
     vehicle, payload = (channels[name].values for name in ("pos_w", "payload_pos_w"))
-    return vehicle.mean(axis=0), payload.mean(axis=0)
+    return vehicle.mean(0), payload.mean(0)
 
 
 def test_flights_hold_what_the_world_hides(tmp_path):

@@ -434,9 +434,9 @@ def test_states_do_not_depend_on_what_was_fitted_before(throw_logs):
 def bend(states) -> np.ndarray:
     """Largest angle between a segment and the mean of its rope, shape (S,) [rad]."""
     n = states["cable_dir_w"]
-    mean = n.mean(axis=1, keepdims=True)
+    mean = n.mean(1, keepdims=True)
     cosine = np.sum(n * mean, axis=-1) / np.linalg.norm(mean, axis=-1)
-    return np.arccos(np.clip(cosine, -1.0, 1.0)).max(axis=1)
+    return np.arccos(np.clip(cosine, -1.0, 1.0)).max(1)
 
 
 def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():

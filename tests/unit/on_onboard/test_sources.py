@@ -40,7 +40,7 @@ def observations(name, seed):
 def find_changes(name):
     """Columns that differ between two throws of other keypoints, goals and payloads."""
     (one, layout, _), (two, _, _) = observations(name, 1), observations(name, 2)
-    return set(np.flatnonzero((one != two).any(axis=0))), layout
+    return set(np.flatnonzero((one != two).any(0))), layout
 
 
 @mark.parametrize("name", ["vision", "vision_betaflight"])

@@ -163,7 +163,7 @@ def test_the_integral_is_limited_alike_both_ways():
     for _ in range(2000):
         command = controller.step(still, level, still, goals, 0.27)
     pushes = command - [0.27 * GRAVITY, 0.0, 0.0, 0.0]
-    assert np.abs(pushes).max(axis=1).min() > 0.05
+    assert np.abs(pushes).max(1).min() > 0.05
     assert_allclose(pushes[:3], -pushes[3:], atol=1e-9)
 
 

@@ -5,7 +5,6 @@ Forces in the body frame are a Gaussian process over body velocity, body rates a
 sparse form: linear in a few radial functions whose weights have a normal prior. It is trained on
 the same statistics as the search."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models import law_terms as laws
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices, Window
 from visthrow.diagnose.select.point import Point, statistics_of
 from visthrow.diagnose.select.terms import strongest_forces
 
@@ -107,7 +106,7 @@ class Trained:
 
 
 def train(
-    point: Point, table: ForceTable, groups: Sequence[int], theta: ndarray | None = None
+    point: Point, table: ForceTable, groups: Indices, theta: ndarray | None = None
 ) -> Trained:
     """Gather what the windows say about the table's weights.
 
@@ -125,7 +124,7 @@ def train(
 
 
 def unexplained(point: Point, seed: int) -> dict | None:
-    """A table of what is left at a point, as plain data; None where none can be made.
+    """A table of what is left at a point, for JSON; None where none can be made.
 
     Force in body axes = sum over functions of weights times (1, inputs, radial functions of the
     inputs), inputs in deviations."""
@@ -138,9 +137,9 @@ def unexplained(point: Point, seed: int) -> dict | None:
     return {
         "label": "unexplained",
         "inputs": "body velocity [m/s], body rates [rad/s], thrust [N], as far as known",
-        "mean": table.mean.tolist(),
-        "deviation": table.deviation.tolist(),
-        "centres": table.centres.tolist(),
+        "mean": table.mean,
+        "deviation": table.deviation,
+        "centres": table.centres,
         "width": WIDTH,
-        "weights": dict(zip(table.blocks, by_block.tolist())),
+        "weights": dict(zip(table.blocks, by_block)),
     }

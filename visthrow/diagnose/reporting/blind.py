@@ -25,10 +25,10 @@ class Completeness:
 
     name: str
     unit: str
-    sizes: tuple[float, ...]  # [unit]
-    exact: tuple[float, ...]  # share named, alone
-    up_to_class: tuple[float, ...]  # share named or within 3 nats of what was named
-    wrong: tuple[float, ...]  # share in which something else was named
+    sizes: ndarray  # [unit], shape (S,), as the shares
+    exact: ndarray  # share named, alone
+    up_to_class: ndarray  # share named or within 3 nats of what was named
+    wrong: ndarray  # share in which something else was named
     # size named, up to class, with probability 0.9 [unit]; NaN where none within its bounds is
     limit: float
 
@@ -88,7 +88,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             rows.append((size, *hits))
         size, exact, similar, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
         limit = _limit(size, similar) * effect.floor if rows else np.nan
-        shares = map(tuple, (size * effect.floor, exact, similar, wrong))
+        shares = size * effect.floor, exact, similar, wrong
         curves.append(Completeness(effect.name, effect.unit, *shares, limit))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
     source = "the flights' own residuals, with random signs a flight"

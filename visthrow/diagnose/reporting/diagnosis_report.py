@@ -12,6 +12,7 @@ import numpy as np
 from visthrow.diagnose.inputs.measures import MEASUREMENTS
 from visthrow.diagnose.likelihood.evidence import ALARM
 from visthrow.diagnose.likelihood.forms import HEAD_SECONDS, readable
+from visthrow.diagnose.models.model_interface import Sizes
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
@@ -163,7 +164,7 @@ def to_json(
     blind: Blind | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything the page says, as plain data, and the lines of :func:`summary`."""
+    """Everything the page says, for JSON, and the lines of :func:`summary`."""
     value = diagnosis.to_dict()
     value["summary"] = list(filter(None, summary(diagnosis, gain).splitlines()))
     for name, part in (("gain", gain), ("blind", blind)):
@@ -229,7 +230,7 @@ def _residuals(diagnosis: Diagnosis) -> Section:
     return section("residuals", "Residuals before and after", *drawn)
 
 
-def _gain(gain: Gain | None, named: Mapping[str, float]) -> Section:
+def _gain(gain: Gain | None, named: Sizes) -> Section:
     """Prediction errors; where nothing was named, only those of the model as it stands."""
     title = "Gain on flights that were not used"
     if gain is None:

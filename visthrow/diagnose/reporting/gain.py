@@ -15,14 +15,9 @@ from visthrow.diagnose.likelihood.correlation import with_correlations
 from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
 from visthrow.diagnose.likelihood.marginal import Noise, finite, grams_of
 from visthrow.diagnose.likelihood.noise_levels import without_outliers
-from visthrow.diagnose.models.model_interface import Model, Window
+from visthrow.diagnose.models.model_interface import Indices, Model, Sizes, Window
 from visthrow.diagnose.reporting.blackbox import table_of, train
-from visthrow.diagnose.select.held_out import (
-    Crossed,
-    Work,
-    channel_gains,
-    crossed,
-)
+from visthrow.diagnose.select.held_out import Crossed, Work, channel_gains, crossed
 from visthrow.diagnose.select.point import Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 
@@ -46,9 +41,9 @@ class LandingGain:
     moved: dict[
         str, float
     ]  # named effect -> mean distance by which it moves the predicted landings
-    # of each throw, prediction less measurement along world x and y
-    off_before: list[list[float]]
-    off_after: list[list[float]]
+    # of each throw, prediction less measurement along world x and y, shape (throws, 2)
+    off_before: ndarray
+    off_after: ndarray
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
 
 
 def landing_gain(
-    work: Work, theta: Mapping[str, float], trained: Mapping[int, Mapping[str, float]], seed: int
+    work: Work, theta: Sizes, trained: Mapping[int, Sizes], seed: int
 ) -> LandingGain | None:
     """Measure the change of predicted landings by the named causes.
 
@@ -125,8 +120,8 @@ def landing_gain(
         released_before=np.nanmean(plain.released_errors[good]),
         released_after=np.nanmean(held_landings.released_errors[good]),
         moved=moved,
-        off_before=plain.off[good].tolist(),
-        off_after=held_landings.off[good].tolist(),
+        off_before=plain.off[good],
+        off_after=held_landings.off[good],
     )
 
 
@@ -146,9 +141,9 @@ class Tested:
 def on_others(
     before: Model,
     after: Model,
-    theta: Mapping[str, float],
+    theta: Sizes,
     diagnosis: Diagnosis,
-    without: Sequence[int] = (),
+    without: Indices = (),
 ) -> Tested:
     """Return prediction errors of flights that nothing was estimated from.
 
@@ -168,7 +163,7 @@ def on_others(
         sums, outliers = _sum_weighted_squares(windows, work.problem, noise)
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
-    rows = np.column_stack((plain, named, floor)).tolist()
+    rows = np.column_stack((plain, named, floor))
     errors = {name: tuple(row) for name, row in zip(after.channels, rows)}
     samples = sum(len(w.residual) for w in windows)
     return Tested(errors, len({w.flight for w in windows}), len(windows), samples, outliers)

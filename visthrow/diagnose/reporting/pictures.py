@@ -101,7 +101,7 @@ def residuals(work: Work, channel: int) -> bytes:
         rows = before.channel == channel
         if rows.any():
             old, new = (left_over(w, work.after.noise)[rows] for w in (before, after))
-            pairs.append((np.mean(old**2) - np.mean(new**2), before, rows, old, new))
+            pairs.append(((old**2).mean() - (new**2).mean(), before, rows, old, new))
     pairs.sort(key=lambda pair: -pair[0])
     usual = pairs[len(pairs) // 2]
     chosen = [*pairs[: SHOWN_WINDOWS - 1], usual] if len(pairs) >= SHOWN_WINDOWS else pairs
@@ -198,8 +198,8 @@ def horizons(gain: Gain) -> bytes:
 def landings(landing: LandingGain) -> bytes:
     """Draw where each throw was predicted to land, relative to where it landed."""
     figure, axis = style.single((WIDTH, 3.6))
-    before = 1e3 * np.array(landing.off_before)
-    after = 1e3 * np.array(landing.off_after)
+    before = 1e3 * landing.off_before
+    after = 1e3 * landing.off_after
     axis.plot(*before.T, **LOOKS["landing_before"], **LOOKS["before"])
     axis.plot(*after.T, **LOOKS["landing_after"], **LOOKS["after"])
     axis.plot(*np.stack((before, after)).transpose(2, 0, 1), **LOOKS["miss"])
@@ -239,11 +239,11 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     """Sizes from which each hidden effect is named in half and in nine tenths of worlds, in floors;
     open to the right if never.
     """
-    pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
+    pairs = [(c, f) for c, f in zip(blind.curves, floors) if len(c.sizes)]
     pairs.sort(key=lambda pair: np.nan_to_num(pair[0].limit / pair[1], nan=np.inf), reverse=True)
     figure, axis = style.single((WIDTH, 0.8 + 0.17 * len(pairs)))
     for y, (curve, floor) in enumerate(pairs):
-        sizes = np.array(curve.sizes) / floor
+        sizes = curve.sizes / floor
         share = np.maximum.accumulate(curve.up_to_class)
         half, top = np.interp((0.5, 0.9), share, sizes)
         axis.plot((half, top), (y, y), color=style.QUIET, **LOOKS["interval"])

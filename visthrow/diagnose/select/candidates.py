@@ -24,6 +24,7 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import FEWEST, INEXACT, Posterior, Priors
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.models.model_interface import Indices
 
 ALL = "all"  # group of a candidate that has one size in all flights
 FLIGHT = "flight"  # group of a candidate with a random share for each flight
@@ -185,24 +186,16 @@ def unit_suffix(unit: str) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
-@dataclass(frozen=True)
-class Scatter:
+@dataclass(frozen=True, kw_only=True)
+class Scatter(RandomEffect):
     """The verdict on a quantity that may vary between flights, days or commands."""
 
-    name: str
-    cause: str
-    equation: str
-    block: str
-    unit: str
-    of: tuple[str, ...]
     found: bool
     size: float  # most probable deviation [unit]
     low: float  # 95 % interval [unit]
     high: float
-    floor: float  # [unit]
     nats: float  # evidence that it varies
     flights: int  # number of flights, days or commands that show it
-    manoeuvres: tuple[str, ...] = ()
     by: str = FLIGHT  # or DAY, or COMMAND
     # effect -> mean over these flights [unit], which is expected in another flight
     mean: Mapping[str, float] = field(default_factory=dict)
@@ -238,7 +231,7 @@ def relinearised_per_flight(
     unit = np.eye(len(theta))[j]
     places = np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])
     simulated = {}
-    for size in (np.unique(places) - theta[j]).tolist():
+    for size in np.unique(places) - theta[j]:
         part = simulate(theta + size * unit)
         if part is not None:
             simulated[size] = part
@@ -276,8 +269,8 @@ def over_deviations(
     density = np.exp(value - best - 0.5 * size**2) * np.sqrt(2.0 / np.pi)
     mass = density * np.gradient(size)
     total = mass.sum()
-    ends = np.searchsorted(np.cumsum(mass) / total, (0.025, 0.975))
-    mode = float(size[np.argmax(density)])
+    ends = np.searchsorted(mass.cumsum() / total, (0.025, 0.975))
+    mode = float(size[density.argmax()])
     return mode, tuple(size[ends].tolist()), float(np.log(total) + best)
 
 
@@ -301,21 +294,14 @@ def judged(
     mode, (low, high), evidence = over_deviations(reach / v.prior_sd, nats, none=0.0)
     mode *= v.prior_sd
     return Scatter(
-        v.name,
-        v.cause,
-        v.equation,
-        v.block,
-        v.unit,
-        tuple(v.of),
-        evidence > threshold and mode > v.floor,
-        mode,
-        v.prior_sd * low,
-        v.prior_sd * high,
-        v.floor,
-        evidence,
-        flights,
-        v.manoeuvres,
-        group,
+        **vars(v),
+        found=evidence > threshold and mode > v.floor,
+        size=mode,
+        low=v.prior_sd * low,
+        high=v.prior_sd * high,
+        nats=evidence,
+        flights=flights,
+        by=group,
     )
 
 
@@ -327,7 +313,7 @@ def allowed(size: float) -> float:
 
 
 def between_flights(
-    statistics: Statistics, priors: Priors, active: Sequence[int], theta: ndarray
+    statistics: Statistics, priors: Priors, active: Indices, theta: ndarray
 ) -> tuple[float, ndarray]:
     """Estimate the variance of selected effects between flights, relative to that which is
     :func:`allowed`; return it and the part of it that remains in the mean of these flights, shape
@@ -353,7 +339,7 @@ def between_flights(
     return variance * bool(active), (share**2).sum(0)
 
 
-def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
+def evidence_of(statistics: Statistics, priors: Priors, named: Indices) -> float:
     """Return log Z of a set of effects, comparable between different integrated shares."""
     square = float(statistics.absolute.square.sum())
     return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square

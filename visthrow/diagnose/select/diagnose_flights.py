@@ -10,7 +10,7 @@ from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.models.model_interface import Indices, Model
 from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names, Scatter
 from visthrow.diagnose.select.point import (
@@ -40,7 +40,7 @@ def diagnose(
     *,
     vehicle: KnownVehicle = UNKNOWN_VEHICLE,
     seed: int = 0,
-    without: Sequence[int] = (),
+    without: Indices = (),
     laws: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
@@ -105,7 +105,7 @@ def explain(
     model: Model,
     *,
     seed: int = 0,
-    without: Sequence[int] = (),
+    without: Indices = (),
     laws: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:

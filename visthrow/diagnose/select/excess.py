@@ -3,8 +3,7 @@
 Gusts and draughts do not depend on what the vehicle does. A latent force that is several times
 stronger in throws than in the quietest phase is therefore an error of the model."""
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
 from dataclasses import replace
 from functools import partial
 
@@ -16,7 +15,7 @@ from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.integrals import fitted
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices, Window
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Level
 
@@ -67,16 +66,16 @@ def floors_of(point: Point) -> dict[tuple[int, str], float]:
     """Return the latent deviation [N or N m] of each block and phase that moves a position by
     ``LANDING`` in the median window.
     """
-    moves: dict[tuple[int, str], list[float]] = {}
+    moves = defaultdict(list)
     reaches = parallel_map(partial(_reaches, positions_of(point)), point.grams, point.windows)
     for gram, reach in zip(point.grams, reaches):
         for block, distance in reach.items():
-            moves.setdefault((block, gram.phase), []).append(distance)
+            moves[block, gram.phase].append(distance)
     medians = {key: np.median(distances) for key, distances in moves.items()}
     return {key: LANDING / median for key, median in medians.items() if median > 0.0}
 
 
-def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, float]:
+def _reaches(positions: Indices, gram: Gram, window: Window) -> dict[int, float]:
     """Return how far unit latents of each block move a position within a window [m]; empty if no
     position was measured.
     """
@@ -85,7 +84,7 @@ def _reaches(positions: Sequence[int], gram: Gram, window: Window) -> dict[int, 
         return {}
     square = (window.latent[rows] @ gram.factor) ** 2
     reaches = {}
-    for block in np.unique(gram.latent_block).tolist():
+    for block in np.unique(gram.latent_block):
         of_block = square @ (gram.latent_block == block)
         reaches[block] = np.sqrt(of_block.max())
     return reaches
@@ -116,7 +115,7 @@ def _upper_limit(point: Point, key: tuple[int, str]) -> float:
     return best * STEP**step
 
 
-def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int] = ()) -> list[str]:
+def acts_on(point: Point, effects: Indices, *, free_effects: Indices = ()) -> list[str]:
     """Return the block on which each of some effects acts, "" if it only changes measurements.
 
     An effect's column is regressed on the columns of each block's latent forces. It acts on the
@@ -143,7 +142,7 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
     return blocks
 
 
-def _explained_squares(inner: ndarray, basis: Sequence[int], columns: ndarray) -> ndarray:
+def _explained_squares(inner: ndarray, basis: Indices, columns: ndarray) -> ndarray:
     """Return the part of each column's sum of squares that other columns explain.
 
     ``inner``: inner products of all columns, shape (P, P); ``basis``: indices of the others.
@@ -151,18 +150,18 @@ def _explained_squares(inner: ndarray, basis: Sequence[int], columns: ndarray) -
     normal = inner[np.ix_(basis, basis)]
     right = inner[np.ix_(basis, columns)]
     normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
-    return np.sum(right * np.linalg.solve(normal, right), axis=0)
+    return (right * np.linalg.solve(normal, right)).sum(0)
 
 
 def too_strong(point: Point, share: float) -> tuple[str, ...]:
     """Return the phases in which the latent force on the vehicle exceeds a share of the thrust that
     carries it.
     """
-    thrusts: dict[str, list[float]] = {}
+    thrusts = defaultdict(list)
     for window in point.windows:
         thrust = window.knots.get("thrust", ())
         if len(thrust):
-            thrusts.setdefault(window.phase, []).append(np.median(np.abs(thrust)))
+            thrusts[window.phase].append(np.median(np.abs(thrust)))
     medians = [np.median(of_phase) for of_phase in thrusts.values()]
     weight = max(medians, default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")

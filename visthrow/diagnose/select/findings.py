@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import MODEL_ERROR_FLOOR, NORMAL_95, POSSIBLE, Sets
-from visthrow.diagnose.models.model_interface import Effect
+from visthrow.diagnose.models.model_interface import Effect, Indices
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.candidates import allowed, unit_suffix
 from visthrow.diagnose.select.point import Point
@@ -48,7 +48,7 @@ class Reading:
     """The flights' information and the possible sets, from which each verdict follows."""
 
     point: Point  # with random shares integrated out
-    active: Sequence[int]  # selected effects
+    active: Indices  # selected effects
     withdrawn: set[int]  # effects that were selected, but do not have the right form
     sets: Sets  # possible sets with the random shares of the best one
     all_sets: Sets  # all possible sets, including their effects that vary between flights
@@ -128,7 +128,7 @@ class Reading:
                 rivals.append(members)
         return rivals
 
-    def _odds_of_none(self, members: Sequence[int]) -> float:
+    def _odds_of_none(self, members: Indices) -> float:
         """Return the odds of the possible sets without any of these effects against those with
         one.
         """
@@ -201,7 +201,7 @@ class Reading:
         score = precision @ (sigma @ posterior.score)
         mean = best @ (slab * score) / value
         coefficients = best / slab / problem.priors.floor[members]
-        first = np.argmax(np.abs(best))
+        first = np.abs(best).argmax()
         scale = coefficients[first]
         unit = effects[first].unit
         text = effects[first].name

@@ -7,7 +7,7 @@ the repeated searches do not find again. Effects that increase the error are wit
 outside the catalogue is kept only if flights that were not used for its coefficient repeat it.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -16,21 +16,10 @@ from numpy import ndarray
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
-from visthrow.diagnose.likelihood.evidence import (
-    FEWEST,
-    NORMAL_95,
-    STRONG,
-    UNKNOWN_RATIO,
-)
-from visthrow.diagnose.likelihood.forms import (
-    HORIZONS,
-    errors,
-    predicted,
-    readable,
-    unit_of,
-)
+from visthrow.diagnose.likelihood.evidence import FEWEST, NORMAL_95, STRONG, UNKNOWN_RATIO
+from visthrow.diagnose.likelihood.forms import HORIZONS, errors, predicted, readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.candidates import (
     DAY,
@@ -173,25 +162,32 @@ def share_of(promised: ndarray, brought: ndarray) -> tuple[float, float, float]:
     """Return the ratio of actual to predicted gain, with a 95 % interval.
 
     For the true size, the actual gain has the predicted one as its mean and twice that as its
-    variance. The interval is Student's from the scatter of the informative flights, or that of this
-    variance if it is wider. ``promised``, ``brought``: predicted and actual gain of each flight
-    [nats], shape (F,)."""
+    variance. ``promised``, ``brought``: predicted and actual gain of each flight [nats], shape
+    (F,)."""
     total = float(promised.sum())
     if total <= 0.0:
         return 0.0, np.nan, np.nan
     value = float(brought.sum()) / total
-    n = count_telling(promised)
-    if n < 2:
-        return value, np.nan, np.nan
-    square = ((brought - value * promised) ** 2).sum()
-    scatter = np.sqrt(n / (n - 1.0) * square) / total
-    chance = NORMAL_95 * np.sqrt(2.0 / total)
-    reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
+    influence = (brought - value * promised) / total
+    reach = _reach(influence, promised, np.sqrt(2.0 / total))
     return value, value - reach, value + reach
 
 
+def _reach(influence: ndarray, promised: ndarray, deviation: float) -> float:
+    """Return half the width of a 95 % interval: Student's from the scatter of the informative
+    flights, or that of noise alone if it is wider; NaN if fewer than two are informative.
+
+    ``influence``: of each flight on the estimate, shape (F,); ``promised``: predicted gain of each
+    [nats]; ``deviation``: of the estimate by noise alone."""
+    n = count_telling(promised)
+    if n < 2 or promised.sum() <= 0.0:
+        return np.nan
+    scatter = np.sqrt(n / (n - 1.0) * (influence**2).sum())
+    return float(max(stdtrit(n - 1, 0.975) * scatter, NORMAL_95 * deviation))
+
+
 def channel_gains(
-    work: Work, groups: Sequence[int], trained: ndarray, box: ndarray | None = None
+    work: Work, groups: Indices, trained: ndarray, box: ndarray | None = None
 ) -> tuple[ChannelGain, ...]:
     """Return the prediction errors of every measured channel on held-out flights.
 
@@ -247,8 +243,7 @@ def gain_of(
 
     Flights excite an effect unequally, and errors of other origin remain in each. So the decrease
     in a flight is compared with the predicted one, and the remaining error with the number of
-    samples. The interval is Student's from the scatter of the informative flights about both, or
-    that of noise alone if it is wider.
+    samples.
 
     Args:
         before: sums of squares by flight, in sigmas, shape (F,).
@@ -264,17 +259,12 @@ def gain_of(
     if old <= 0.0 or left <= 0.0:
         return 0.0, np.nan, np.nan
     fall = before - after
-    n = count_telling(0.5 * promised)
-    reach = np.nan
-    if n > 1 and total > 0.0:
-        rest = after - left * count / count.sum()
-        differing = fall - fall.sum() * promised / total
-        # influence of each flight on log(after / before)
-        influence = (fall.sum() / left * rest - differing) / old
-        scatter = stdtrit(n - 1, 0.975) * np.sqrt(n / (n - 1.0) * (influence**2).sum())
-        # by noise alone, a decrease has 4 times the predicted one as its variance
-        chance = NORMAL_95 * np.sqrt(4.0 * total) / old
-        reach = max(scatter, chance)
+    rest = after - left * count / count.sum()
+    differing = fall - fall.sum() * promised / max(total, 1e-300)
+    # influence of each flight on log(after / before)
+    influence = (fall.sum() / left * rest - differing) / old
+    # by noise alone, a decrease has 4 times the predicted one as its variance
+    reach = _reach(influence, 0.5 * promised, np.sqrt(4.0 * total) / old)
     value = np.log(left / old)
     return tuple((1.0 - np.exp(0.5 * (value + np.array([0.0, reach, -reach])))).tolist())
 
@@ -536,10 +526,10 @@ def _kind(work: Work, channel: int) -> str:
     windows = [w for w in work.after.windows if np.any(w.channel == channel)]
     by_axis = np.zeros(3)
     by_flight = Counter()
-    halves: dict[bool, list[float]] = {False: [], True: []}  # of the flights
-    times: dict[int, list[float]] = {}
+    halves = {False: [], True: []}  # of the flights
+    times = defaultdict(list)
     for window in windows:
-        times.setdefault(window.flight, []).append(window.time.mean())
+        times[window.flight].append(window.time.mean())
     for window in windows:
         rows = window.channel == channel
         innovation, _, horizon = predicted(window, point.noise, window.residual)
@@ -549,7 +539,7 @@ def _kind(work: Work, channel: int) -> str:
         by_flight[window.flight] += square.sum()
         of_flight = times[window.flight]
         middle = 0.5 * (min(of_flight) + max(of_flight))
-        halves[bool(window.time.mean() > middle)] += square.tolist()
+        halves[window.time.mean() > middle] += square.tolist()
     parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
         parts.append(f"mostly along {'xyz'[by_axis.argmax()]}")
@@ -561,7 +551,7 @@ def _kind(work: Work, channel: int) -> str:
     return ", ".join(parts)
 
 
-def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, float]:
+def repeated_share(point: Point, laws: Indices) -> tuple[float, float, float]:
     """Return the ratio of actual to predicted gain of laws on held-out flights, with its 95 %
     interval; effects keep their sizes from all flights.
 

@@ -12,7 +12,6 @@ corrected by C q, and the uncertainty of C m is one of their nuisances.
 
 Source: Jordan, Ghahramani, Jaakkola and Saul 1999, section 6 (mean field as a lower bound)."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,14 +24,8 @@ from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.forms import predicted
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.candidates import (
-    COARSE,
-    COMMAND,
-    REACH,
-    Scatter,
-    evidence_of,
-    judged,
-)
+from visthrow.diagnose.models.model_interface import Indices
+from visthrow.diagnose.select.candidates import COARSE, COMMAND, REACH, Scatter, evidence_of, judged
 from visthrow.diagnose.select.point import ROUNDS, Point, statistics_of
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
@@ -94,7 +87,7 @@ def _improve(score: ndarray, information: ndarray, share: float, lost: ndarray) 
 
 
 def _bound_evidence(
-    statistics: Statistics, priors: Priors, named: Sequence[int], share: float, lost: ndarray
+    statistics: Statistics, priors: Priors, named: Indices, share: float, lost: ndarray
 ) -> tuple[float, ndarray]:
     """Return a lower bound of log Z of a set of effects for a share of lost commands, and the
     probability of each command; ``lost``: a guess of these, shape (W, T).
@@ -116,7 +109,7 @@ def _bound_evidence(
 
 
 def _profile(
-    statistics: Statistics, priors: Priors, named: Sequence[int], shares: ndarray
+    statistics: Statistics, priors: Priors, named: Indices, shares: ndarray
 ) -> tuple[ndarray, list[ndarray]]:
     """Return the gain of each share of lost commands over none, with a set of effects [nats], and
     the probabilities of the commands at each; ``shares``: ascending.
@@ -159,12 +152,12 @@ def _least_explained(point: Point) -> list[int]:
     errors = []
     for window in point.windows:
         innovation, expected, _ = predicted(window, point.noise, window.residual)
-        errors.append(np.mean(innovation**2 / expected))
+        errors.append((innovation**2 / expected).mean())
     return np.sort(np.argsort(errors)[-LOOKED_AT:]).tolist()
 
 
 def verdict(
-    point: Point, active: Sequence[int], threshold: float
+    point: Point, active: Indices, threshold: float
 ) -> tuple[Scatter, tuple[ndarray, ...]] | None:
     """Judge whether commands were lost, both beside a set of effects and beside all effects.
 
@@ -191,7 +184,7 @@ def verdict(
             return None
     counts = [changes.shape[1] for changes in columns]
     scatter = judged(v, reach, least, threshold, sum(counts), COMMAND)
-    lost = probabilities[1][int(np.argmax(least))]
+    lost = probabilities[1][least.argmax()]
     count = len(priors.floor)
     scatter = _with_size(scatter, statistics.information[:, count:, count:], lost)
     return scatter, tuple(row[:length] for row, length in zip(lost, counts))

@@ -75,7 +75,7 @@ class Linear:
         and by how many nats the evidence there exceeds that integrated over the prior.
         """
         if chosen not in self._shares:
-            listed: dict[Candidate, float] = {}
+            listed = {}
             occam = 0.0
             random = [c for c in chosen if c.group != ALL]
             for c in sorted(random, key=lambda c: c.name):
@@ -167,7 +167,7 @@ class Linear:
         if not self.random:
             return []
         theta = self.total(subset).mean(columns_of(subset))
-        close: dict[Candidate, float] = {}
+        close = {}
         for group in (FLIGHT, DAY, EVENT):
             members = [c for c in self.random if c.group == group]
             if not members:
@@ -215,7 +215,7 @@ class Linear:
         """Return sets with two candidates more, which may replace one or two others, with their
         values. Two effects that cancel each other show no gain alone.
         """
-        listed: dict[Names, float] = {}
+        listed = {}
         for subset in (chosen - set(g) for n in range(3) for g in combinations(chosen, n)):
             offered = [c for c in self.plain if c not in subset and not c.law]
             base = self.value(subset)
@@ -253,8 +253,8 @@ def window(
         pairs: whether pairs of candidates are tried.
     """
     values = {chosen: linear.value(chosen) for chosen in begin}
-    opened: set[Names] = set()
-    paired: set[Names] = set()
+    opened = set()
+    paired = set()
     in_vain = 0
     while True:
         best = max(values.values())

@@ -31,8 +31,15 @@ from visthrow.diagnose.likelihood.marginal import (
     with_residuals,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
-from visthrow.diagnose.select.candidates import Shares, estimate_shares, freed
+from visthrow.diagnose.models.model_interface import (
+    Effect,
+    Indices,
+    Linearised,
+    Model,
+    Sizes,
+    Window,
+)
+from visthrow.diagnose.select.candidates import Shares, estimate_shares, evidence_of, freed
 
 ROUNDS = 3
 """Limit for Gauss-Newton steps between two linearisations, for successive linearisations, and for
@@ -61,7 +68,7 @@ class Problem:
     lost: tuple[ndarray, ...] = ()
 
     @staticmethod
-    def of(model: Model, windows: Sequence[Window], numbers: Sequence[int]) -> "Problem":
+    def of(model: Model, windows: Sequence[Window], numbers: Indices) -> "Problem":
         """Set up a problem with some of a model's windows; estimate their noise correlation."""
         plain = Problem(model, tuple(numbers))
         slabs = plain.priors.slab * plain.priors.floor
@@ -83,7 +90,7 @@ class Problem:
         """Return which effects are switches to another kind of block, shape (K,), bool."""
         return np.array([e.switch for e in self.effects], dtype=bool)
 
-    def only(self, windows: Sequence[int]) -> "Problem":
+    def only(self, windows: Indices) -> "Problem":
         """Return the problem with some of its windows."""
         lost = tuple(self.lost[w] for w in windows) if self.lost else ()
         return replace(self, kept=tuple(self.kept[w] for w in windows), lost=lost)
@@ -168,10 +175,10 @@ class Point:
         visible = np.flatnonzero(self.problem.priors.visible & ~self.problem.switches)
         return with_noise_at(self, self.posterior.estimate(visible))
 
-    def evidence(self, active: Sequence[int]) -> float:
+    def evidence(self, active: Indices) -> float:
         """Return log Z of a set of effects, comparable between points with other noise levels."""
-        misfit = 0.5 * float(self.statistics.absolute.square.sum())
-        return self.posterior.log_evidence(active) - misfit + self.noise.log_prior
+        nats = evidence_of(self.statistics, self.problem.priors, active)
+        return nats + self.noise.log_prior
 
 
 def regathered(point: Point, integrals: Integrals | None = None, **changes: Any) -> Point:
@@ -241,9 +248,7 @@ def linearise(
     )
 
 
-def _commands(
-    problem: Problem, sizes: Mapping[str, float], windows: Sequence[Window]
-) -> list[ndarray]:
+def _commands(problem: Problem, sizes: Sizes, windows: Sequence[Window]) -> list[ndarray]:
     """Return the change of each window if a command is lost, shape (N, T) each."""
     commands = []
     for change, window in zip(problem.model.without_commands(sizes, problem.kept), windows):
@@ -285,7 +290,7 @@ def _losing(window: Window, columns: ndarray, lost: ndarray) -> Window:
 
 
 def statistics_of(
-    point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Sequence[int]
+    point: Point, windows: Sequence[Window], columns: Sequence[ndarray], rows: Indices
 ) -> Statistics:
     """Return the statistics of windows with further columns after those of the effects; windows
     with fewer columns are padded with 0.
@@ -310,7 +315,7 @@ def statistics_of(
     return Integrals(grams, noise).statistics(grams, point.theta)
 
 
-def only(point: Point, windows: Sequence[int]) -> Point:
+def only(point: Point, windows: Indices) -> Point:
     """Return the point with some of its windows, and noise levels estimated from these."""
     grams = [point.grams[w] for w in windows]
     noise = levels.maximised(grams, levels.only(point.noise, grams, windows))[0]
@@ -383,10 +388,10 @@ def curvature(origin: Point, moved_point: Point) -> float:
     grams = with_residuals(moved_point.grams, moved_point.windows, floors, bent)
     total = moved_point.integrals.statistics(grams, moved_point.theta).score.sum(0)
     sizes = moved_point.posterior.covariance(()) @ total
-    return float(np.abs(sizes).max(initial=0.0))
+    return np.abs(sizes).max(initial=0.0)
 
 
-def with_floors_noise(point: Point, active: Sequence[int]) -> Point:
+def with_floors_noise(point: Point, active: Indices) -> Point:
     """Return the point with noise levels estimated with every effect at its posterior mean, where
     effects that are not selected stay below their floors.
 
@@ -423,14 +428,14 @@ def shifted(gram: Gram, change: ndarray) -> Gram:
     return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
 
 
-def fitted(point: Point, active: Sequence[int]) -> Point:
+def fitted(point: Point, active: Indices) -> Point:
     """Fit the sizes of effects by Gauss-Newton steps, with fixed derivatives and simulated
     residuals; a step that does not lower the misfit is halved.
 
     ``point``: where the derivatives were taken; ``active``: effects that are fitted; all others
     become 0."""
     named = np.isin(np.arange(len(point.theta)), list(active))
-    best: Point | None = point
+    best = point
     if np.any(point.theta[~named] != 0.0):
         best = moved(point, np.where(named, point.theta, 0.0))
     if best is None:
@@ -448,7 +453,7 @@ def fitted(point: Point, active: Sequence[int]) -> Point:
     return best
 
 
-def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) -> float:
+def predicted_gain(point: Point, active: Indices, switches: bool = False) -> float:
     """Return the gain that another step of these effects' sizes promises [nats]; ``switches``:
     whether switches take part in it.
     """
@@ -478,10 +483,10 @@ def _step(point: Point, goal: ndarray) -> Point | None:
 
 def _misfit(point: Point) -> float:
     prior = (point.theta / point.problem.priors.slab)[point.theta != 0.0]
-    return float(point.statistics.square.sum() + prior @ prior)
+    return point.statistics.square.sum() + prior @ prior
 
 
-def candidate(point: Point, active: Sequence[int]) -> Point:
+def candidate(point: Point, active: Indices) -> Point:
     """Fit the sizes of a set and the noise levels alternately: what counted as gusts at first is
     gradually explained by the sizes.
 

@@ -10,6 +10,7 @@ from math import isnan
 from typing import Any
 
 from sim.params import LawParams
+from visthrow.diagnose.models.model_interface import Sizes
 from visthrow.diagnose.select.candidates import Scatter, unit_suffix
 from visthrow.diagnose.throw.command_mistakes import Mistake
 
@@ -175,7 +176,7 @@ class Diagnosis:
     reasons: tuple[str, ...]  # for the overall verdict
     findings: tuple[Finding, ...]  # one for each effect, in the model's order
     # sizes to be set in the model: those of selected effects, one of each class
-    theta: Mapping[str, float]
+    theta: Sizes
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
     steps: tuple[SelectionStep, ...] = ()

@@ -14,11 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.evidence import (
-    INEXACT,
-    SPIKE,
-    STRONG,
-)
+from visthrow.diagnose.likelihood.evidence import INEXACT, SPIKE, STRONG
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import terms
@@ -163,8 +159,8 @@ class Selector:
         listed = self._list_sets()
         leads = {}
         least = -np.inf
-        near: list[Trial] = []  # others are dropped, as a trial's matrices are large
-        better: list[Trial] = []
+        near = []  # others are dropped, as a trial's matrices are large
+        better = []
         while chosen := self._choose_next(listed, leads, least):
             leads[chosen] = -np.inf
             tried = self._try(self.best.point, [chosen])
@@ -225,7 +221,7 @@ class Selector:
         The prediction of a move is corrected by the largest shortfall of its parts."""
         done = set(tried) | self._visited
         present = self.best.chosen
-        shortfalls: dict[Names, float] = {}
+        shortfalls = {}
         for simulated, nats in self._simulated.items():
             if nats < -WINDOW:
                 done.add(simulated)
@@ -268,7 +264,7 @@ class Selector:
         """
         point = self.best.point
         change = point.posterior.estimate(columns_of(chosen)) - point.theta
-        nats = 0.5 * float(change @ point.information @ change)
+        nats = 0.5 * change @ point.information @ change
         return min(WINDOW, STRONG + INEXACT * nats)
 
     def _try(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
@@ -461,7 +457,7 @@ class Selector:
         self._proposed.add(present)
         places = [(self.best.point, self.best.columns)]
         places += [(self.nominal, columns_of(forms))] if present - forms else []
-        shortlist: list[TermEffect] = []
+        shortlist = []
         for point, active in places:
             shortlist += terms.shortlist(point, active, strongest, self.threshold)
         shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())

@@ -6,6 +6,7 @@ screened without a simulation: each window needs A' G' V^-1 G A only, with V as 
 :mod:`visthrow.diagnose.likelihood.marginal`. The best terms become effects of the problem
 (:attr:`visthrow.diagnose.select.point.Problem.terms`), and are selected like any other effect."""
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,7 +36,7 @@ from visthrow.diagnose.models.law_terms import (
     table,
     terms_of,
 )
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices
 from visthrow.diagnose.select.excess import LANDING, positions_of
 from visthrow.diagnose.select.point import Point, regathered, with_shares, with_terms
 from visthrow.diagnose.select.result import Law
@@ -116,7 +117,7 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
 class Survey:
     """Information of windows about forces at their knots, given a set of selected effects."""
 
-    def __init__(self, point: Point, parts: Statistics, active: Sequence[int]):
+    def __init__(self, point: Point, parts: Statistics, active: Indices):
         """Store a point and the statistics of its windows; ``active``: the selected effects."""
         posterior = point.posterior
         self.point = point
@@ -194,7 +195,7 @@ class Survey:
         gain[size <= 1e-9 * most] = -np.inf
         return gain, prior
 
-    def unsaid(self, screened: Screen, causes: Sequence[int]) -> ndarray:
+    def unsaid(self, screened: Screen, causes: Indices) -> ndarray:
         """Return the gain of each term that no single effect of any size could replace [nats],
         shape (T,).
 
@@ -248,7 +249,7 @@ def _hats(terms: Sequence[Term], places: Mapping[str, ndarray], values: KnotValu
 
 
 def best_curves(
-    point: Point, active: Sequence[int], strongest: Mapping[str, float]
+    point: Point, active: Indices, strongest: Mapping[str, float]
 ) -> dict[str, tuple[float, str]]:
     """Return the gain of the best curve of each block beside the selected effects [nats], minus the
     log of the number of curves, and its formula; blocks without knots are missing.
@@ -309,7 +310,7 @@ def without_laws(point: Point) -> Point:
 
 def shortlist(
     point: Point,
-    active: Sequence[int],
+    active: Indices,
     strongest: Mapping[str, float],
     threshold: float,
 ) -> list[TermEffect]:
@@ -332,7 +333,7 @@ def shortlist(
         simpler = sum(d <= depth for d in depths)
         price[depth] = np.log(simpler)
     present = {e.term for e in problem.terms}
-    ranked: list[tuple[float, Term, float]] = []
+    ranked = []
     for block, screened in screens.items():
         gain, prior = survey.gains(screened, UNKNOWN_RATIO * strongest[block])
         gain[survey.unsaid(screened, causes) < LAW] = -np.inf
@@ -371,10 +372,10 @@ def strongest_forces(point: Point) -> dict[str, float]:
     """Return the latent force of each block in the phase in which it is strongest [N or N m]; empty
     if a window has no knots.
     """
-    strongest: dict[str, float] = {}
+    strongest = defaultdict(float)
     for (block, _), level in point.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
-        strongest[name] = max(strongest.get(name, 0.0), level)
+        strongest[name] = max(strongest[name], level)
     if set(strongest) == set(LATENT_BLOCKS):
         strongest[JOINT] = strongest[level_block(JOINT)]
     return strongest if all(w.knots for w in point.windows) else {}
@@ -384,15 +385,15 @@ def moves_landing(point: Point, j: int) -> bool:
     """Return whether an effect moves a position by ``LANDING`` in the median window of a phase."""
     positions = positions_of(point)
     size = point.theta[j] * point.problem.priors.floor[j]
-    moves: dict[str, list[float]] = {}
+    moves = defaultdict(list)
     for window in point.windows:
         rows = np.isin(window.channel, positions)
         distance = np.abs(size * window.effects[rows, j]).max(initial=0.0)
-        moves.setdefault(window.phase, []).append(distance)
+        moves[window.phase].append(distance)
     return any(np.median(distances) > LANDING for distances in moves.values())
 
 
-def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
+def laws(point: Point, active: Indices, nats: float) -> tuple[Law, ...]:
     """Return the terms of a set with their coefficients and deviations; ``nats``: their gain."""
     sigma = point.posterior.covariance(active)
     mean = sigma @ point.posterior.score

@@ -1,5 +1,6 @@
 """Turn a selection into verdicts: one for every effect and one overall, each with its reason."""
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 
@@ -8,13 +9,9 @@ from scipy.special import gammaincinv
 
 from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import (
-    ALARM,
-    INEXACT,
-    MODEL_ERROR_FLOOR,
-)
+from visthrow.diagnose.likelihood.evidence import ALARM, INEXACT, MODEL_ERROR_FLOOR, Sets
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
-from visthrow.diagnose.models.model_interface import Model, Window
+from visthrow.diagnose.models.model_interface import Indices, Model, Window
 from visthrow.diagnose.select import result, terms
 from visthrow.diagnose.select.candidates import (
     ALL,
@@ -35,13 +32,7 @@ from visthrow.diagnose.select.candidates import (
     relinearised_per_flight,
     unit_suffix,
 )
-from visthrow.diagnose.select.excess import (
-    acts_on,
-    compares_phases,
-    floors_of,
-    levels,
-    too_strong,
-)
+from visthrow.diagnose.select.excess import acts_on, compares_phases, floors_of, levels, too_strong
 from visthrow.diagnose.select.findings import Reading, blank
 from visthrow.diagnose.select.held_out import Work, repeated_share, share_text
 from visthrow.diagnose.select.occam import Linear
@@ -70,7 +61,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     calm = with_floors_noise(point, selection.best.columns)
     block_levels = levels(selection.nominal, calm, selection.threshold)
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
-    explanations: list[tuple[Law, ...]] = []
+    explanations = []
     if overall == result.UNKNOWN:
         explanations, unrepeated = _explanations(selection)
         reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
@@ -87,12 +78,14 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
     in_units = {problem.effects[j].name: sizes[j] * problem.priors.floor[j] for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
-    sets = _sets_of(selection)
-    reading = Reading(shared_point, active, withdrawn, sets, _all_sets(selection), unlike)
+    reading = Reading(shared_point, active, withdrawn, *_sets_of(selection), unlike)
     findings = tuple(reading.finding(j) for j in range(len(model.effects)))
     named = [findings[j] for j in active]
     theta = {f.name: f.estimate for f in named}
     spread = _covariance(shared_point, named, active, mean_part)
+    listed = []
+    for trial, nats in selection.window:
+        listed.append((tuple(sorted(c.name for c in trial.chosen)), nats))
     return Diagnosis(
         overall,
         block,
@@ -102,7 +95,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         spread,
         selection.threshold,
         steps=tuple(selection.steps),
-        sets=_list_sets(selection),
+        sets=tuple(listed),
         levels=block_levels,
         laws=_different(explanations),
         events=_events(selection, point),
@@ -139,7 +132,7 @@ def _add_means(scatter: Sequence[Scatter], means: Mapping[str, float]) -> tuple[
 def _covariance(
     point: Point,
     named: Sequence[Finding],
-    active: Sequence[int],
+    active: Indices,
     mean_part: np.ndarray,
 ) -> tuple[tuple[float, ...], ...]:
     """Return the joint covariance of the findings' sizes, including the variance that differences
@@ -165,6 +158,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
     problem = selection.problem
     priors = selection.problem.priors
     catalogue = {v.name: v for v in random_effects()}
+    means = [c for c in selection.candidates if c.group == ALL]
     verdicts = []
     shares = dict(best.point.shares)
     for c in _list_asked(selection, catalogue.keys()):
@@ -172,7 +166,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Shares]:
         statistics = best.point.plain
         beside = best.chosen
         if usual:
-            beside |= _means_of(selection, c)
+            beside |= {m for m in means if {*m.columns} & {*c.columns}}
         elif len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
         fixed_shares = {o: size for o, size in best.point.shares.items() if o != c}
@@ -193,12 +187,6 @@ def _list_asked(selection: Selector, usual: Set[str]) -> list[Candidate]:
     selected = [c for c in varying if c in selection.best.chosen]
     others = usual - {c.name for c in selected}
     return [c for c in varying if c in selected or (c.group == FLIGHT and c.name in others)]
-
-
-def _means_of(selection: Selector, random: Candidate) -> set[Candidate]:
-    """Return the candidates for the means of the effects that have a random share."""
-    shared_sizes = [c for c in selection.candidates if c.group == ALL]
-    return {c for c in shared_sizes if {*c.columns} & {*random.columns}}
 
 
 def share_verdict(
@@ -227,7 +215,7 @@ def share_verdict(
     return judged(replace(effect, name=c.name), reach, nats, needed, count, c.group)
 
 
-def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
+def _straight(point: Point, active: Indices, j: int) -> Statistics:
     named = np.isin(np.arange(len(point.theta)), list(active))
     theta = np.where(named, point.theta, 0.0)
 
@@ -238,7 +226,7 @@ def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
     return relinearised_per_flight(point.plain, theta, point.problem.priors, j, simulate)
 
 
-def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) -> Point:
+def _about_means(point: Point, active: Indices, varying: Iterable[int]) -> Point:
     """Return the point with random shares integrated out, linearised at the means of the selected
     effects that vary.
     """
@@ -249,36 +237,20 @@ def _about_means(point: Point, active: Sequence[int], varying: Iterable[int]) ->
     return replace(point, plain=shared, shares={})
 
 
-def _list_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:
-    """Return the names of each possible set, and how many nats it is behind the best."""
-    sets = []
-    for trial, nats in selection.window:
-        sets.append((tuple(sorted(c.name for c in trial.chosen)), nats))
-    return tuple(sets)
-
-
-def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
-    """Return the effects of each possible set with the best set's random shares, and how many nats
-    it is behind.
+def _sets_of(selection: Selector) -> tuple[Sets, Sets]:
+    """Return the effects of each possible set with the best set's random shares, and those of every
+    possible set, including effects that vary between flights; and how many nats each is behind.
     """
     random = {c for c in selection.best.chosen if c.group != ALL}
-    sets = []
+    alike = []
+    every = []
     for trial, nats in selection.window:
         varying = {c for c in trial.chosen if c.group != ALL}
         if varying == random and not laws_of(trial.chosen):
-            sets.append((tuple(trial.columns), nats))
-    return sets
-
-
-def _all_sets(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
-    """Return the effects of each possible set, including those that vary between flights, and how
-    many nats it is behind.
-    """
-    sets = []
-    for trial, nats in selection.window:
+            alike.append((tuple(trial.columns), nats))
         effects = {j for c in trial.chosen if c.group != EVENT for j in c.columns}
-        sets.append((tuple(sorted(effects)), nats))
-    return sets
+        every.append((tuple(effects), nats))
+    return alike, every
 
 
 def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
@@ -331,7 +303,7 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
     """Return each law once, with the coefficient from the best explanation."""
-    laws: dict[str, Law] = {}
+    laws = {}
     for together in explanations:
         for law in together:
             laws.setdefault(law.formula, law)
@@ -536,9 +508,9 @@ def _list_by_block(selection: Selector) -> dict[str, list[int]]:
     """Return the selected effects that act on each block; empty without a calm phase to compare
     with, as the residuals then show a wrong form.
     """
-    blocks: dict[str, list[int]] = {}
+    blocks = defaultdict(list)
     for j in selection.names if compares_phases(selection.nominal) else ():
-        blocks.setdefault(selection.block_of(j), []).append(j)
+        blocks[selection.block_of(j)].append(j)
     blocks.pop("", None)
     return blocks
 
