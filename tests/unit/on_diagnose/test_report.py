@@ -381,7 +381,7 @@ def test_an_event_is_left_out_or_weighs_little(diagnosed):
         line for line in report.summary(with_events).splitlines() if line.startswith("EVENT")
     )
     assert f"flight {min(flights)} " in little
-    assert little.endswith("weighs little")
+    assert little.endswith("has less weight")
     assert f"flight {max(flights) + 1} " in out
     assert out.endswith("left out")
     parts = [part.text for part in report.sections(with_events)[0].parts if hasattr(part, "text")]

@@ -180,7 +180,7 @@ class PassedBy(Pushed):
 def test_a_law_that_other_flights_do_not_repeat_is_not_printed():
     diagnosis = diagnose_flights.explain(PassedBy(law="passing", law_size=0.4, seed=3))
     assert diagnosis.overall == result.UNKNOWN
-    (reason,) = [r for r in diagnosis.reasons if "left out do not repeat it" in r]
+    (reason,) = [r for r in diagnosis.reasons if "held-out ones do not repeat it" in r]
     flight = int(reason.partition("; flight ")[2].split()[0])
     assert flight in diagnosis.work.after.plain.flights
     assert "fly more like that one" in reason
@@ -269,7 +269,7 @@ def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch)
     monkeypatch.setattr(verdicts, "_parts_of", lambda *_: {1})
     _, block, reasons, _ = verdicts._misshapen(selection, [])
     assert block == "vehicle force"
-    assert "F = f(v_z), with any function f, explains 90 nats" in reasons[0]
+    assert "F = f(v_z), with some function f, explains 90 nats" in reasons[0]
 
 
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
