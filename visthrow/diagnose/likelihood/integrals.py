@@ -6,7 +6,6 @@ The formulas are those of :mod:`visthrow.diagnose.likelihood.marginal`.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy import ndarray
@@ -80,7 +79,7 @@ def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray
 
 def _shapes(grams: Sequence[Gram], noise: Noise) -> list[_Shape]:
     """Factorise the normal equations of windows."""
-    return list(map(partial(_shape, noise=noise), grams, noise.share))
+    return [_shape(gram, share, noise) for gram, share in zip(grams, noise.share)]
 
 
 def _shape(gram: Gram, share: ndarray, noise: Noise) -> _Shape:

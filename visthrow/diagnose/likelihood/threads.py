@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 from sim.cores import cores as cores
 
-T = TypeVar("T")
 R = TypeVar("R")
 
 THREADS = 4  # with 8, a diagnosis on 16 cores took an eighth longer, because of Python's lock

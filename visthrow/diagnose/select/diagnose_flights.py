@@ -117,7 +117,7 @@ def explain(
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
-    simulated = [finite(window) for window in windows]
+    simulated = list(map(finite, windows))
     considered = [i for i, w in enumerate(windows) if w.flight not in without]
     usable = tuple(i for i in considered if simulated[i])
     if 2 * len(usable) < len(considered) or not usable:

@@ -108,7 +108,8 @@ def _likelihood(point: Point, key: tuple[int, str], level: float) -> float:
 def _upper_limit(point: Point, key: tuple[int, str]) -> float:
     """Return the largest level of a block that a phase's residuals allow, one-sided 97.5 %."""
     best = point.noise.latent_sd[key]
-    least = _likelihood(point, key, best) - 0.5 * NORMAL_95**2
+    of_phase = [gram.phase == key[1] for gram in point.grams]
+    least = -0.5 * (point.by_window.square[of_phase].sum() + NORMAL_95**2)
     for step in range(1, MOST_STEPS):
         if _likelihood(point, key, best * STEP**step) < least:
             break

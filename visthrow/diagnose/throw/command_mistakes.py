@@ -68,11 +68,13 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     full = 4.0 * plant.vehicle.controller.max_thrust
     units = thrust_checks.UNITS | {"shares of the full thrust": full}
     mistakes = []
+    related = None
     for look in (_axes, _rate_unit):
-        relations = [relation for relation in map(_relate_rates, logs) if relation is not None]
-        if relations and (mistake := look(relations)) is not None:
+        related = related or list(filter(None, map(_relate_rates, logs)))
+        if related and (mistake := look(related)) is not None:
             mistakes.append(mistake)
             logs = list(map(mistake.mended, logs))
+            related = None  # corrected commands relate otherwise
     mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
     return mistakes if mistake is None else [*mistakes, mistake]
 
