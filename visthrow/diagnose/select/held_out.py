@@ -30,7 +30,7 @@ from visthrow.diagnose.select.candidates import (
     freed,
     shared,
 )
-from visthrow.diagnose.select.excess import compares_phases, floors_of
+from visthrow.diagnose.select.excess import LANDING, compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
 from visthrow.diagnose.select.point import Point, Problem
@@ -404,8 +404,11 @@ def _describe_known(diagnosis: Diagnosis) -> str:
 
 
 def _find_unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
-    """Return the channels whose remaining error is far above the noise."""
-    return [c for c in gains if c.after > UNKNOWN_RATIO * c.floor]
+    """Return the channels whose remaining error is far above the noise and, for a position, large
+    enough to matter for a landing.
+    """
+    negligible = {"m": LANDING}
+    return [c for c in gains if c.after > max(UNKNOWN_RATIO * c.floor, negligible.get(c.unit, 0.0))]
 
 
 def _innovations(diagnosis: Diagnosis) -> Diagnosis:

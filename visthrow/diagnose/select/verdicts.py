@@ -493,7 +493,9 @@ def _answer_explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer
     """Return KNOWN or NO EFFECT, if nothing is missing."""
     if selection.best.columns:
         return result.KNOWN, "", [], set()  # the reason comes from held-out flights
-    nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
+    nothing = (
+        f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise matters"
+    )
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
     unlike = sorted(c.name for c in selection.best.chosen if c.group == EVENT)
