@@ -42,7 +42,7 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
 
 @mark.parametrize("change", ['task.observation.layout="state"', "task.target.speed=[0.1,0.2]"])
 def test_what_cannot_be_calibrated_is_refused(change):
-    with raises(ConfigError, match="calibration in the hover"):
+    with raises(ConfigError, match="calibration in hover"):
         start_calibrated(experiment(change))
 
 

@@ -35,7 +35,7 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
     assert train(folder, "--set", "steps=2", "--minutes", "1e-9") == 0
     assert "stopped at step 0" in capsys.readouterr().out
     assert train(folder, "--set", "steps=2") == 2
-    assert "go on with --resume" in capsys.readouterr().err
+    assert "continue with --resume" in capsys.readouterr().err
     assert train(folder, "--set", "steps=2", "--resume") == 0
     assert "trained at step 2" in capsys.readouterr().out
     made = Networks.load(folder / "learnt.npz")

@@ -133,7 +133,7 @@ def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(
     assert stopped.made_by["figures"]["iterations"] == 2
     assert len(json.loads((folder / "evaluation.json").read_text())["figures"]["throws"]) == 3
     assert not (folder / "summary.json").exists()
-    command = capsys.readouterr().err.split("go on with: visthrow ")[1].split("\n")[0]
+    command = capsys.readouterr().err.split("continue with: visthrow ")[1].split("\n")[0]
     monkeypatch.setattr(Trainer, "step", step)
     assert (
         cli.main([*command.split(), "--device", "cpu"]) == 0
@@ -152,7 +152,7 @@ def test_minutes_leave_a_policy(tmp_path, capsys):
     printed = capsys.readouterr()
     assert "success" not in printed.out
     assert (
-        "the time is over after iteration 1 of 4; go on with: visthrow train --resume"
+        "reached the time limit after iteration 1 of 4; continue with: visthrow train --resume"
         in printed.err
     )
 
@@ -317,6 +317,6 @@ def test_the_recorded_seeds_are_those_of_the_record():
 def test_the_end_compares_the_seed_with_recorded_ones(capsys):
     session._compare("state_fast", [{"target": 2.0, "error_mean": 0.0001}])
     printed = capsys.readouterr().out
-    assert re.search(r"at 2\.0 m (\d+) of \1 recorded seeds landed farther off", printed)
+    assert re.search(r"at 2\.0 m (\d+) of \1 recorded seeds had a larger error", printed)
     session._compare("mine.toml", [{"target": 2.0, "error_mean": 0.0001}])
     assert not capsys.readouterr().out

@@ -144,8 +144,8 @@ def _compare_runs(args: argparse.Namespace) -> int:
 
     if args.policies:
         raise ConfigError(
-            f"--from with policies {' '.join(args.policies)}; the runs say which policies were"
-            " flown"
+            f"--from with policies {' '.join(args.policies)}; expected no policies, as the runs"
+            " name theirs"
         )
     writable(Path(args.out))
     logs = from_runs.logs_of(args.runs)
@@ -166,7 +166,7 @@ def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence
 def check(targets: Sequence[float]) -> None:
     """Raise ConfigError if a target is given twice."""
     if len(set(targets)) < len(targets):
-        raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: the same one twice")
+        raise ConfigError(f"--targets {' '.join(f'{x:g}' for x in targets)}: one is given twice")
 
 
 def throw_hybrid(

@@ -34,9 +34,7 @@ def run(args: argparse.Namespace) -> int:
     writable(folder)
     if importlib.util.find_spec("mujoco") is None:
         paths = _throw_here(loaded, folder, args.throws)
-        print(
-            "The reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'\n"
-        )
+        print("Without the reference plant: it needs MuJoCo, pip install 'visthrow[reference]'\n")
     else:
         from visthrow.throws.reference_protocol import Throwing
 
@@ -45,15 +43,15 @@ def run(args: argparse.Namespace) -> int:
         with Throwing(*throws, together=True) as throwing:
             paths = _throw_here(loaded, folder, args.throws)
             print(
-                f"{count} throws a policy on the reference plant, independent code with less noise"
-                " than training ...",
+                f"{count} throws per policy on the reference plant, independent code with less"
+                " noise than training ...",
                 flush=True,
             )
             paths += _write_table(loaded, throwing.results(), "reference-realistic", folder)
     print(PAPER_NOTE + "\n\nFiles:")
     for path in paths:
         print(f"  {path}")
-    print(f"\nAll of it took {time.perf_counter() - begin:.0f} s.")
+    print(f"\nTotal time: {time.perf_counter() - begin:.0f} s.")
     return 0
 
 
@@ -69,7 +67,7 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
     log = throw_once(loaded[1], [2.0, 0.0, 0.0], "hybrid", SEED)
     paths = fly.write(folder, log, loaded[1].experiment)
     print(fly.summary_text(log) + "\n")
-    print(f"{throws} throws a policy and target in the training simulator ...", flush=True)
+    print(f"{throws} throws per policy and target in the training simulator ...", flush=True)
     return paths + _write_table(
         loaded,
         compare.throw_hybrid(loaded, compare.DEFAULT_TARGETS, throws, "cpu", SEED),

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         paths.append(eyes.sheet(Path(args.out) / "pixels.png"))
     print(summary_text(log))
     for key, value in loaded.departures.items():
-        print(f"flown with another {key} than trained with: {value}")
+        print(f"flown under another condition than in training: {key} = {value}")
     for path in args.export:
         export(path, log, loaded.experiment)
         print(f"{path}  the flight for other programs")
@@ -86,7 +86,9 @@ def _check(args: argparse.Namespace) -> None:
             )
         load_extra(*formats[ending], f"--export {path}", ConfigError)
     if args.no_rope and (args.pixels or args.save or args.export or args.plant != "hybrid"):
-        raise ConfigError("--no-rope with --pixels, --save, --export or --plant; expected it alone")
+        raise ConfigError(
+            "--no-rope with --pixels, --save, --export or --plant; expected it without these"
+        )
     for override in args.overrides:
         if override.startswith("task.noise.command"):
             raise ConfigError(
@@ -114,7 +116,7 @@ def _make_rendered_eyes(loaded, method: str, seed: int):
     rendered = load_extra("visthrow.detector_training.eyes", "detector", "--pixels", ConfigError)
     if loaded.policy.contract["observation"]["layout"] != "vision":
         raise ConfigError(
-            f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
+            f"--pixels with the state policy '{loaded.name}'; expected a vision policy"
         )
     experiment = loaded.experiment
     return rendered.RenderedEyes(
@@ -161,7 +163,7 @@ def summary_text(log) -> str:
     if "separation" in times:
         separation_time = log["separation"].values[0]
         lines.append(
-            f"throw   release asked for {times['latch'] - start:.2f} s and done"
+            f"throw   release commanded {times['latch'] - start:.2f} s, separation"
             f" {times['separation'] - start:.2f} s after the start, payload at x"
             f" {separation_time[0]:.2f} m, z {separation_time[2]:.2f} m"
         )

@@ -143,7 +143,7 @@ def correlation(x: ndarray, y: ndarray) -> Interval:
     y = np.asarray(y, dtype=float)
     if len(x) != len(y) or len(x) < 3 or not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
         raise ValueError(
-            f"{len(x)} and {len(y)} numbers; expected three or more pairs, not all alike"
+            f"{len(x)} and {len(y)} numbers; expected three or more pairs that vary on both sides"
         )
     index = np.random.default_rng(0).integers(len(x), size=(DRAWS, len(x)))
     samples = _pearson(x[index], y[index])

@@ -113,7 +113,7 @@ def require_room(path: str | Path, unpacked: int, error: type[Exception]) -> Non
     if unpacked > limit:
         raise error(
             f"{path}: {size / 1e6:.1f} MB that unpack to at least {unpacked / 1e6:.0f} MB; expected"
-            f" {limit / 1e6:.0f} MB at most. Where it is right, unpack it first"
+            f" {limit / 1e6:.0f} MB at most. If the file is correct, unpack it first"
         )
 
 
@@ -169,7 +169,7 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, ndar
         # for a file that is no archive, numpy recommends pickle
         why = "no .npz archive" if "pickle" in str(cause) else cause
         raise error(
-            f"{path}: cut short or damaged ({size} bytes: {why}); expected {what}"
+            f"{path}: truncated or damaged ({size} bytes: {why}); expected {what}"
         ) from cause
 
 

@@ -187,7 +187,7 @@ def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> ConfigTable:
     resolved = path.resolve()
     if resolved in stack:
         chain = " -> ".join(_display_path(step) for step in (*stack, resolved))
-        raise ConfigError(f"{name}: files include or build on each other in a circle: {chain}")
+        raise ConfigError(f"{name}: files include or extend each other in a cycle: {chain}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:

@@ -72,8 +72,8 @@ def layout_of(experiment: TeamExperiment) -> ob.Layout:
     layout = ob.layout_of(experiment.task.observation)
     if layout.fits:
         raise ConfigError(
-            "task.observation.located, or a moving target, in a team; expected neither: no member"
-            " fits the goal over a throw"
+            "task.observation.located, or a moving target, in a team; expected neither: members do"
+            " not fit the goal over a throw"
         )
     messages = MESSAGE * (experiment.team.vehicles - 1) + 2
     return dataclasses.replace(layout, setup=messages)

@@ -113,7 +113,7 @@ def train(args: argparse.Namespace) -> int:
     saved = folder / CHECKPOINT
     if saved.exists() != args.resume:
         if saved.exists():
-            present = "holds a training; go on with --resume, or name another folder"
+            present = "holds a training; continue with --resume, or give another folder"
         else:
             present = "no checkpoint to resume from"
         raise VisthrowError(f"{folder}: {present}")

@@ -168,7 +168,7 @@ class CalibrationError(VisthrowError):
     """A hover whose data do not suffice for a calibration."""
 
 
-NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
+NO_ANSWER = "calibration found no finite solution; expected finite poses, thrusts and keypoints"
 
 HOVER = 1.5  # duration of a hover before the sway [s]
 SWAY = 1.5  # duration of the sway [s]
@@ -210,8 +210,8 @@ class CalibrationProblem:
         visible = hovered.valid[:, GOAL_KEYPOINTS:].all(1)
         if count < LEAST_STEPS or visible.mean() < LEAST_VISIBLE:
             raise CalibrationError(
-                f"calibration from {count} steps, the ball seen in {100 * visible.mean():.0f} % of"
-                f" them; expected {LEAST_STEPS} or more, and {100 * LEAST_VISIBLE:.0f} %"
+                f"calibration from {count} steps, the ball detected in {100 * visible.mean():.0f} %"
+                f" of them; expected {LEAST_STEPS} or more, and {100 * LEAST_VISIBLE:.0f} %"
             )
         tensor = lambda value: torch.tensor(np.asarray(value), dtype=torch.float64)  # noqa: E731
         rope = contract["rope"]
@@ -458,8 +458,8 @@ def calibrate(
             break
     else:
         raise CalibrationError(
-            f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway,"
-            " its ball in view"
+            f"calibration did not converge in {ROUNDS} iterations; expected a hover that ends in a"
+            " sway, with the ball in view"
         )
     covariance = torch.cholesky_inverse(factor[width:, width:])  # the constants are last
     sigma = problem.split(covariance.diagonal().sqrt()[None])

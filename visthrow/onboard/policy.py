@@ -80,7 +80,7 @@ class Policy:
             stated = section.get("dimension") if isinstance(section, Mapping) else None
             if stated not in (None, dimension):
                 raise PolicyError(
-                    f"the contract says {part} dimension {stated}, the network has {dimension}"
+                    f"the contract states {part} dimension {stated}, the network has {dimension}"
                 )
 
     @property
@@ -338,13 +338,14 @@ def _check_shapes(policy: Policy) -> None:
     weights = policy.weights
     if not weights or len(weights) != len(policy.biases):
         raise PolicyError(
-            f"got {len(weights)} weights and {len(policy.biases)} biases; expected a pair a layer"
+            f"got {len(weights)} weights and {len(policy.biases)} biases; expected one of each for"
+            " each layer"
         )
     width = weights[0].shape[-1]
     if policy.estimator is not None and len(policy.estimator.output_bias) != width:
         raise PolicyError(
-            f"the estimator gives {len(policy.estimator.output_bias)} numbers; the first layer"
-            f" takes {width}"
+            f"the estimator outputs {len(policy.estimator.output_bias)} numbers; expected {width},"
+            " the inputs of the first layer"
         )
     named = [("normalizer mean", policy.mean), ("normalizer std", std)]
     if (policy.mean is None) != (std is None):
@@ -413,7 +414,7 @@ def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
     if version != FORMAT_VERSIONS[estimates]:
         raise PolicyError(
             f"format version {version}, but {'an' if estimates else 'no'} estimator; expected one"
-            f" in version {FORMAT_VERSIONS[1]} alone"
+            f" only in version {FORMAT_VERSIONS[1]}"
         )
     schema = {"activation": str, "contract": dict, "made_by": dict}
     for key, kind in schema.items():

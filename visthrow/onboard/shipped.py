@@ -17,6 +17,4 @@ def find_policy(name: str | Path) -> Path:
         if candidate.is_file():
             return candidate
     shipped = suggest(str(name), (path.stem for path in SHIPPED.glob("*.npz")))
-    raise PolicyError(
-        f"no policy '{name}': neither a file nor one that comes with visthrow; {shipped}"
-    )
+    raise PolicyError(f"no policy '{name}': neither a file nor a shipped policy; {shipped}")

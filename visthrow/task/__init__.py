@@ -83,7 +83,7 @@ class ObservationParams(Bounded):
         if not 0.0 <= low <= high < 1.0:
             raise ConfigError(
                 f"task.observation.latency is {low} to {high} s; expected an ascending range from 0"
-                " up to a second"
+                " to less than 1 s"
             )
         if self.latency_jitter > low:
             raise ConfigError(

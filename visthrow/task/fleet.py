@@ -175,8 +175,8 @@ def specialise(
         or policy.std is None
     ):
         raise PolicyError(
-            "policy with a contract of one vehicle; expected one that was trained for a fleet, with"
-            " setup given"
+            "the policy's contract is for one vehicle; expected a policy that was trained for a"
+            ' fleet with setup = "given"'
         )
     one = single_vehicle(experiment, number)
     chosen = members(experiment)[number]

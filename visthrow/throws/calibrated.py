@@ -43,8 +43,8 @@ def start_calibrated(
     observation = experiment.task.observation
     if observation.layout != "vision" or experiment.task.target.moves:
         raise ConfigError(
-            f"calibration in the hover: layout {observation.layout!r}; expected 'vision' and goals"
-            " that stand still"
+            f"calibration in hover: layout {observation.layout!r}; expected 'vision' and goals that"
+            " do not move"
         )
 
     def begin(env: "ThrowEnv") -> "TensorDict":

@@ -33,9 +33,9 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
             else:
                 hint = "no such folder"
             ticks = folder / RUN_TICKS
-            advice = f"Of a run that was killed they are made by: visthrow hil view {folder}"
+            advice = f"If the run was killed, create them with: visthrow hil view {folder}"
             if ticks.is_file() and '"state": "throw"' not in ticks.read_text(errors="replace"):
-                advice = "No throw was begun in this run"
+                advice = "No throw was started in this run"
             raise LogError(
                 f"{folder}: no {PATTERN} in it ({hint or 'empty'}); expected the folder of a run"
                 f" with throws. {advice}"
@@ -70,7 +70,7 @@ def entries(logs: list[FlightLog]) -> list[Entry]:
             distance = round(float(np.linalg.norm(_offset(log))), 2)
         except (KeyError, TypeError) as error:
             raise LogError(
-                f"a log holds no throw of a run: {error!r}; it knows {', '.join(log.meta)}"
+                f"a log does not hold a throw of a run: {error!r}; it has {', '.join(log.meta)}"
             ) from error
         groups.setdefault(key, {}).setdefault(distance, []).append(log)
     targets = sorted({distance for by_distance in groups.values() for distance in by_distance})

@@ -104,7 +104,7 @@ def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
     if part not in groups:
         sections = sorted(name for name in groups if "." not in name)
         raise ConfigError(
-            f"allow '{part}': a contract has {', '.join(sections)} and their entries, but not that;"
+            f"allow '{part}': not in a contract, which has {', '.join(sections)} and their entries;"
             f" {suggest(part, groups)}"
         )
 

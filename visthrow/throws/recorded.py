@@ -171,7 +171,7 @@ def check_goal(loaded: Loaded, goal_w: ndarray) -> None:
     distance = float(np.hypot(*goal_w[:2]))
     trained = loaded.experiment.task.start.goal_radius
     if distance > limit:
-        where = f"the goal lies {distance:g} m away; the vehicle may not leave {limit:g} m"
+        where = f"the goal is {distance:g} m away; the vehicle's bounds are {limit:g} m"
         raise ConfigError(f"{where}, and '{loaded.name}' was trained on goals within {trained:g} m")
 
 

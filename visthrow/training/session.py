@@ -78,7 +78,7 @@ def run(args: Namespace) -> int:
         if args.iterations:
             command += f" --iterations {args.iterations}"
         print(
-            f"\n{why} after iteration {iteration} of {last}; go on with: {command}",
+            f"\n{why} after iteration {iteration} of {last}; continue with: {command}",
             file=sys.stderr,
         )
     return 0 if why == OUT_OF_TIME else EXIT_INTERRUPTED
@@ -88,15 +88,15 @@ def _check(args: Namespace) -> None:
     """Raise TrainError for arguments that contradict each other."""
     if args.until is not None and args.until >= EVALUATION_TARGET:
         raise TrainError(
-            f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected an error"
-            " below that, in m"
+            f"--until {args.until:g} m; throws are at {EVALUATION_TARGET:g} m: expected a smaller"
+            " error, in m"
         )
     if args.resume and args.start:
-        raise TrainError("--resume goes on with its own policy; --from starts a new run")
+        raise TrainError("--resume continues with the run's policy; --from starts a new run")
     if args.resume and not args.out and not args.config:
         raise TrainError("--resume: name the run's folder with --out")
     if not args.resume and not args.config:
-        raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
+        raise TrainError("no CONFIG; expected a name in configs/train, such as laptop, or a file")
 
 
 def _begin(args: Namespace, path: Path, folder: Path) -> tuple:
@@ -132,18 +132,18 @@ def _resume(args: Namespace, path: Path | None, folder: Path) -> tuple:
         and config.load(Experiment, path).task.observation != experiment.task.observation
     ):
         raise CheckpointError(
-            f"{folder}: a run of another configuration than {path.stem}; resume with --out alone"
+            f"{folder}: the run has another configuration than {path.stem}; resume with only --out"
         )
     seed = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))["seed"]
     if args.seed not in (None, seed):
-        raise CheckpointError(f"{folder}: a run of another seed, {seed}; resume without --seed")
+        raise CheckpointError(f"{folder}: the run has the seed {seed}; resume without --seed")
     return experiment, None, seed
 
 
 DONE, REACHED, OUT_OF_TIME, STOPPED = ENDS = (
     "finished",
-    "reached the error that was asked for",
-    "the time is over",
+    "reached the requested error",
+    "reached the time limit",
     "stopped",
 )
 """Reasons why a training stopped."""
@@ -249,8 +249,8 @@ def _compare(name: str | None, rows: list[dict]) -> None:
         return
     worse = sum(error > errors[0] for error in recorded)
     print(
-        f"at {EVALUATION_TARGET} m {worse} of {len(recorded)} recorded seeds landed farther off;"
-        f" they were {min(recorded):.3f} to {max(recorded):.3f} m off"
+        f"at {EVALUATION_TARGET} m {worse} of {len(recorded)} recorded seeds had a larger error;"
+        f" their errors were {min(recorded):.3f} to {max(recorded):.3f} m"
     )
 
 

@@ -88,7 +88,7 @@ def calibrate(args: argparse.Namespace) -> int:
     out = Path(args.out)
     if out.suffix != ".toml":
         raise ConfigError(
-            f"--out {out}; expected a file that ends in .toml, as every configuration"
+            f"--out {out}; expected a file that ends in .toml, like every configuration"
         )
     like = config.load(CameraParams, config.find("camera", args.like))
     first = Path(args.source[0])
@@ -175,7 +175,7 @@ def verdict(camera: CameraParams, report: BoardReport, best: BoardReport) -> tup
         reason = "the bias that training draws (noise.bias_std)"
     else:
         reason = "what noise of the corners explains"
-    word = "fits" if excess <= limit else "does NOT fit; calibrate anew"
+    word = "fits" if excess <= limit else "does NOT fit; calibrate again"
     return (
         excess <= limit,
         (

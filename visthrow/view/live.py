@@ -43,7 +43,8 @@ def web_viewer(layout: Any, web_port: int, data_port: int) -> Iterator[Any]:
     try:
         if not _answers(server, web_port):
             raise DeviceError(
-                f"the viewer did not start; are ports {web_port} and {data_port} free? name others"
+                f"the viewer did not start; expected free ports {web_port} and {data_port}, or give"
+                " others"
             )
         print(
             f"look at http://{HOST}:{web_port}?url={quote(data, safe='')}",

@@ -44,7 +44,7 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     if "separation" not in times or "landing" not in times:
         raise LogError(
             "the flight has no release and landing to draw:"
-            f" {meta['result'].get('failure') or 'it was cut short'}"
+            f" {meta['result'].get('failure') or 'it is incomplete'}"
         )
     start = times["policy_start"]
     separation = times["separation"]
@@ -129,8 +129,8 @@ def _bounds(log: FlightLog) -> Vector:
     top = path[:, 2].max()
     if top <= 0.0:
         raise LogError(
-            f"vehicle and payload were below the floor all the time, {-top:.1f} m or more: there is"
-            " nothing to draw"
+            f"vehicle and payload were always {-top:.1f} m or more below the floor; expected a"
+            " flight above it"
         )
     return float(x.min() - MARGIN), float(x.max() + MARGIN), float(top + 0.6 * MARGIN)
 

@@ -250,8 +250,8 @@ def test_a_hover_that_shows_too_little_is_reported():
         np.zeros((rows, 8), bool),
         np.array([2.0, 0.0, 0.0]),
     )
-    assert "the ball seen in 0 % of them; expected 75 or more, and 50 %" in try_calibration(
+    assert "the ball detected in 0 % of them; expected 75 or more, and 50 %" in try_calibration(
         hovered, params.camera, contract, Spreads()
     )
     broken = replace(hovered, valid=np.ones((rows, 8), bool), thrust=np.full(rows, 1e150))
-    assert "no finite answer" in str(try_calibration(broken, params.camera, contract, Spreads()))
+    assert "no finite solution" in str(try_calibration(broken, params.camera, contract, Spreads()))

@@ -155,7 +155,7 @@ def test_truncated_files_are_refused(policy, tmp_path, kept):
     policy.save(path)
     data = path.read_bytes()
     path.write_bytes(data[: int(kept * len(data))])
-    with raises(PolicyError, match="cut short or damaged"):
+    with raises(PolicyError, match="truncated or damaged"):
         Policy.load(path)
 
 

@@ -286,7 +286,7 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
 def test_a_folder_in_which_nothing_is_done_makes_no_record(path, tmp_path):
     with raises(
         StorageError,
-        match=r"nothing of the list .* is done there; expected what 'visthrow sweep run",
+        match=r"no unit of the list .* is done; expected the results of 'visthrow sweep run",
     ):
         collect(load_list(path), tmp_path / "nothing", tmp_path / "records")
     assert not (tmp_path / "records").exists()
@@ -361,7 +361,7 @@ def test_the_status_of_a_sweep_says_how_it_ended(
     assert run_command(f"sweep run {path} --out {tmp_path} --devices cpu") == status
     printed = capsys.readouterr().err
     assert ("state-1 failed: out of memory" in printed) == bool(outcome.failed)
-    assert ("the same command goes on" in printed) == outcome.stopped
+    assert ("the same command continues" in printed) == outcome.stopped
 
 
 @mark.parametrize(

@@ -119,9 +119,9 @@ def test_what_holds_no_throws(tmp_path, refused):
     with raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
         from_runs.logs_of([tmp_path])
     (tmp_path / "ticks.jsonl").write_text('{"n": 0, "state": "ready"}\n')
-    with raises(LogError, match="No throw was begun in this run"):
+    with raises(LogError, match="No throw was started in this run"):
         from_runs.logs_of([tmp_path])
     bare = FlightLog({}, {"policy": "x"})
-    with raises(LogError, match="holds no throw of a run"):
+    with raises(LogError, match="does not hold a throw of a run"):
         from_runs.entries([bare])
-    refused(f"compare vision --from {tmp_path}", message="the runs say which policies")
+    refused(f"compare vision --from {tmp_path}", message="the runs name theirs")

@@ -400,7 +400,7 @@ def test_table_says_success_rate_and_leaves_failures_blank():
     ("words", "message"),
     [
         ("fly --policy visoin", "no policy 'visoin'"),
-        ("fly --policy DROPPER --target 7", "the goal lies 7 m away"),
+        ("fly --policy DROPPER --target 7", "the goal is 7 m away"),
         ("fly --policy DROPPER --target nan", "three finite numbers"),
         ("fly --policy DROPPER --target 1 2 3", "a distance, or x and y"),
         ("fly --policy DROPPER --plant real", "no plant 'real'"),

@@ -199,7 +199,7 @@ def test_a_wrong_base_of_a_table_is_refused(text, message):
 def test_circles_are_refused(write):
     write("a.toml", 'base = "b.toml"')
     path = write("b.toml", 'base = "a.toml"')
-    with raises(ConfigError, match=r"circle: .*b\.toml -> .*a\.toml -> .*b\.toml"):
+    with raises(ConfigError, match=r"cycle: .*b\.toml -> .*a\.toml -> .*b\.toml"):
         config.load(Outer, path)
 
 

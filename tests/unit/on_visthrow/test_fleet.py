@@ -179,7 +179,7 @@ def test_one_vehicles_experiment_is_the_same_task_at_its_size():
 def test_a_policy_of_one_vehicle_is_not_specialised():
     base = load_experiment("state")
     with raises(
-        PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"
+        PolicyError, match="for one vehicle; expected a policy that was trained for a fleet"
     ):
         specialise(random_policy(base), of("x500"))
 

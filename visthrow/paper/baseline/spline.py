@@ -335,7 +335,7 @@ def flat_reference(model: Pendulum, path: ndarray) -> tuple[ndarray, ndarray]:
     chain = np.moveaxis(path[..., PLANE], 1, 0)
     if np.any(np.linalg.norm(chain[2] + UP, axis=1) < 1e-3 * GRAVITY):
         raise PlanError(
-            "the planned payload falls freely; expected a taut cable all along the path"
+            "the planned payload falls freely; expected a taut cable along the whole path"
         )
     force, change, direction, first = _thrust(model, chain)
     pitch = np.arctan2(force[:, 0], force[:, 1])

@@ -51,8 +51,8 @@ def release_for(target: float, height: float, speed: float, landing_height: floa
     """
     if not (height > landing_height and speed > 0.0):
         raise ConfigError(
-            f"release at {height:g} m height with {speed:g} m/s; expected above the landing's"
-            f" {landing_height:g} m and above 0"
+            f"release at {height:g} m height with {speed:g} m/s; expected a height above that of"
+            f" the landing, {landing_height:g} m, and a positive speed"
         )
     fall = float(fall_time(np.float64(height - landing_height), np.float64(0.0)))
     pos_w = np.array([target - speed * fall, 0.0, height])

@@ -68,9 +68,9 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     finally:
         signal.signal(signal.SIGTERM, before)
     for name, reason in outcome.failed.items():
-        print(f"{name} failed: {reason}; all it printed is in {out / 'logs'}", file=sys.stderr)
+        print(f"{name} failed: {reason}; its output is in {out / 'logs'}", file=sys.stderr)
     if outcome.stopped:
-        print("stopped before the end; the same command goes on", file=sys.stderr)
+        print("stopped before the end; the same command continues", file=sys.stderr)
     if outcome.interrupted:
         return EXIT_INTERRUPTED
     return 1 if outcome.failed else 0

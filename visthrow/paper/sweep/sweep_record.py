@@ -46,7 +46,7 @@ def status(work: SweepWork, out: Path) -> tuple[list[str], bool]:
 def _state(source: ResultSource, out: Path) -> tuple[str, float]:
     """Return a description of a training's state, and its duration so far [s]."""
     if not source.config:
-        return "there already", 0.0
+        return "existing policy", 0.0
     rows = _progress(source, out)
     seconds = sum(_sum_seconds(rows)[-1:])
     count = f"{len(rows)} of {source.iterations} iterations"
@@ -56,7 +56,7 @@ def _state(source: ResultSource, out: Path) -> tuple[str, float]:
         return f"done in {seconds:.0f} s{place}", seconds
     if is_locked(lock_of(out, source.id)):
         return f"running, {count}", seconds
-    return f"stopped after {count}" if rows else "not begun", seconds
+    return f"stopped after {count}" if rows else "not started", seconds
 
 
 def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
@@ -72,8 +72,8 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
     thrown = [unit for unit in units if unit.is_done(out)]
     if not runs and not thrown and not throws.exists():
         raise StorageError(
-            f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep"
-            f" run {work.name}' made"
+            f"{out}: no unit of the list '{work.name}' is done; expected the results of 'visthrow"
+            f" sweep run {work.name}'"
         )
     names = dict.fromkeys(source.name for source in work.sources)
     results.write_line(training, {"runs": [runs[name] for name in names if name in runs]})

@@ -50,7 +50,7 @@ def hold_lock(path: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             raise BusyError(
-                f"{path}: another process works on it: {file.read() or 'it does not say which'}"
+                f"{path}: another process holds the lock: {file.read() or 'unknown'}"
             ) from None
         file.truncate(0)
         json.dump({"process": os.getpid(), "machine": platform.node(), "since": time.time()}, file)
