@@ -255,7 +255,7 @@ def test_broken_checkpoints_are_refused(tmp_path, refused, change, message):
 def test_resume_under_another_seed_or_configuration_is_refused(tmp_path, refused):
     folder = tmp_path / "run"
     assert train(folder, "--iterations", "1") == 0
-    refused(*words(folder, "--resume", "--seed", "2"), message="another seed, 1")
+    refused(*words(folder, "--resume", "--seed", "2"), message="has the seed 1")
     refused(*words(folder, "--resume", "--set", "ppo.clip=0.3"), message="not that of --set")
     refused(
         f"train vision --resume --out {folder} --device cpu",
