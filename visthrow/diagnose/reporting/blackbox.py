@@ -1,9 +1,9 @@
-"""What is left as a smooth table over the state, unexplained: the yardstick for named causes, and
-the last resort without one.
+"""A black-box model of the residual forces: the reference for the selected effects, and a
+substitute where none explains the flights.
 
-Forces in the body frame are a Gaussian process over body velocity, body rates and thrust, in its
-sparse form: linear in a few radial functions whose weights have a normal prior. It is trained on
-the same statistics as the search."""
+Forces in the body frame are a sparse Gaussian process over body velocity, body rates and thrust:
+linear in a few radial functions, whose weights have a normal prior. The model is trained on the
+same statistics as the search for effects."""
 
 from dataclasses import dataclass
 
@@ -19,14 +19,15 @@ from visthrow.diagnose.select.point import Point, statistics_of
 from visthrow.diagnose.select.terms import strongest_forces
 
 CENTRES = 20
-WIDTH = 1.5  # width of a radial function, in deviations of the inputs
+WIDTH = 1.5  # width of a radial function, in standard deviations of the inputs
 REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
-"""Prior deviations of the weights, in the block's strongest latent force; the likeliest is taken.
+"""Prior standard deviations of the weights to choose from by likelihood, in multiples of the
+block's strongest latent force.
 """
 
 
 def _inputs(window: Window) -> ndarray:
-    """Body velocity, body rates and thrust at the knots, as far as they are known, shape (k, I)."""
+    """Return the known ones of body velocity, body rates and thrust at the knots, shape (k, I)."""
     knots = dict(window.knots)
     count = len(knots.get("time", ()))
     if "vel_w" in knots and "quat_wb" in knots:
@@ -37,21 +38,21 @@ def _inputs(window: Window) -> ndarray:
 
 @dataclass(frozen=True)
 class ForceTable:
-    """A force table: ``force_b = weights' radial(inputs)``; torques likewise."""
+    """A linear model of forces and torques in the body frame: ``weights' radial(inputs)``."""
 
     mean: ndarray  # of the inputs, shape (I,)
-    deviation: ndarray
-    centres: ndarray  # in deviations, shape (M, I)
+    deviation: ndarray  # standard deviation of the inputs, shape (I,)
+    centres: ndarray  # of the radial functions, in standard deviations, shape (M, I)
     blocks: tuple[str, ...]
 
     def radial(self, inputs: ndarray) -> ndarray:
-        """Basis functions: constant, linear, radial; shape (k, 1 + I + M)."""
+        """Return the basis functions: constant, linear, radial; shape (k, 1 + I + M)."""
         z = (inputs - self.mean) / self.deviation
         distance = ((z[:, None, :] - self.centres) ** 2).sum(-1)
         return np.hstack((np.ones((len(z), 1)), z, np.exp(-0.5 * distance / WIDTH**2)))
 
     def columns(self, window: Window) -> ndarray:
-        """Latent-force coefficients of every weight, shape (L, weights)."""
+        """Return the latent-force coefficients of every weight, shape (L, weights)."""
         basis = self.radial(_inputs(window))
         values = laws.KnotValues(window.knots)
         parts = []
@@ -66,8 +67,8 @@ class ForceTable:
 
 
 def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
-    """Choose the basis from the states that were flown; None where windows carry no knots, or no
-    latent force acts.
+    """Choose the basis functions from the flown states; None if windows have no knots or the model
+    has no latent force.
     """
     blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
     if not blocks or not all("time" in w.knots and w.latent.size for w in point.windows):
@@ -83,13 +84,16 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
 
 @dataclass(frozen=True)
 class Trained:
-    """Information of groups of windows on the table's W weights."""
+    """Statistics of the table's W weights by group of windows."""
 
-    statistics: Statistics  # of the effects, and behind them of the weights
-    reach: ndarray  # prior deviation of each weight at reach 1, shape (W,)
+    statistics: Statistics  # of the effects, followed by the weights
+    reach: ndarray  # prior standard deviation of each weight at reach 1, shape (W,)
 
     def weights(self, keep: ndarray) -> ndarray:
-        """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
+        """Return the posterior mean of the weights from some groups, at the likeliest reach.
+
+        ``keep``: mask of the groups. Shape of the result: (W,).
+        """
         chosen = self.statistics.only(keep)
         of_weights = slice(-len(self.reach), None)
         information = chosen.information.sum(0)[of_weights, of_weights]
@@ -108,10 +112,10 @@ class Trained:
 def train(
     point: Point, table: ForceTable, groups: Indices, theta: ndarray | None = None
 ) -> Trained:
-    """Gather what the windows say about the table's weights.
+    """Compute the statistics of the table's weights.
 
-    ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
-    shape (K,); default 0."""
+    ``point``: linearised at any sizes; ``groups``: group of each window; ``theta``: sizes of the
+    effects that act besides the table, in floors, shape (K,); default 0."""
     columns = [w.latent @ table.columns(w) for w in point.windows]
     statistics = statistics_of(point, point.windows, columns, range(len(columns)))
     effects = len(point.theta)
@@ -124,10 +128,10 @@ def train(
 
 
 def unexplained(point: Point, seed: int) -> dict | None:
-    """A table of what is left at a point, for JSON; None where none can be made.
+    """Return a table of the residual forces at a point, for JSON; None if none can be trained.
 
-    Force in body axes = sum over functions of weights times (1, inputs, radial functions of the
-    inputs), inputs in deviations."""
+    Force in body axes = weights times (1, inputs, radial functions of the inputs), with inputs in
+    standard deviations."""
     table = table_of(point, np.random.default_rng(seed))
     if table is None:
         return None

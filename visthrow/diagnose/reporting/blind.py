@@ -1,7 +1,8 @@
-"""Effects hidden in the user's own noise: which sizes would have been named in these flights.
+"""Detection limits: the sizes from which effects would be selected in the user's flights.
 
-The worlds are drawn from the statistics: scores of the flights' own residuals with random signs a
-flight, every effect somewhere within its floor, plus the score of the hidden effect."""
+Effects are hidden in simulated statistics of the flights. The score of such a world is the sum of
+the flights' residual scores with a random sign for each flight, of all effects at random sizes
+within their floors, and of the hidden effect."""
 
 from dataclasses import dataclass
 
@@ -14,44 +15,45 @@ from visthrow.diagnose.select.result import Diagnosis
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
 
 DRAWS = 200
-# fewer give too few patterns of signs; noise is then drawn from its fitted level
+# fewer flights have too few combinations of signs; noise is then drawn from its fitted level
 FEWEST_FLIGHTS = 6
 NAMED = 0.9
 
 
 @dataclass(frozen=True)
 class Completeness:
-    """The share of trials in which one effect is named, by its size."""
+    """The share of worlds in which a hidden effect is selected, by its size."""
 
     name: str
     unit: str
-    sizes: ndarray  # [unit], shape (S,), as the shares
-    exact: ndarray  # share named, alone
-    up_to_class: ndarray  # share named or within 3 nats of what was named
-    wrong: ndarray  # share in which something else was named
-    # size named, up to class, with probability 0.9 [unit]; NaN where none within its bounds is
+    sizes: ndarray  # hidden sizes [unit], shape (S,); the shares have the same shape
+    exact: ndarray  # share in which the effect is selected
+    up_to_class: ndarray  # share in which it is less than 3 nats behind the selected effect
+    wrong: ndarray  # share in which another effect is selected and this one is further behind
+    # size that is found, up to its class, with probability 0.9 [unit]; NaN if none within the
+    # bounds is
     limit: float
 
 
 @dataclass(frozen=True)
 class Blind:
-    """Detection limits in one set of flights."""
+    """Detection limits of all effects in one set of flights."""
 
     curves: tuple[Completeness, ...]
-    false_alarms: float  # share of worlds without a hidden effect in which something was named
+    false_alarms: float  # share of worlds without a hidden effect in which an effect was selected
     worlds: int
-    noise: str  # where the noise came from
+    noise: str  # source of the noise, in words
 
     def __getitem__(self, name: str) -> Completeness:
         return next(c for c in self.curves if c.name == name)
 
 
 def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
-    """Hide each effect at rising sizes in the flights' own noise and see whether the statistics
-    name it.
+    """Hide each effect at increasing sizes in the flights' noise, and count how often it is
+    selected.
 
-    ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; what it named is
-    taken out first; ``draws``: worlds for each effect, size and sign."""
+    ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; its selected
+    effects are subtracted first; ``draws``: worlds for each effect, size and sign."""
     work = diagnosis.work
     rng = np.random.default_rng(seed)
     priors = work.problem.priors
@@ -98,8 +100,8 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
 
 
 def _limit(size: ndarray, share: ndarray) -> float:
-    """Size from which on the share stays at or above NAMED, interpolated in the logarithm of the
-    size.
+    """Return the size from which on the share stays at or above NAMED, interpolated in the
+    logarithm of the size; NaN if the share at the largest size is below NAMED.
     """
     below = np.flatnonzero(share < NAMED)
     if not len(below):

@@ -1,6 +1,4 @@
-"""``visthrow diagnose blind``: effects hidden in your own noise, and which sizes of them would have
-been named.
-"""
+"""``visthrow diagnose blind``: detection limits of all effects in the given flights."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +11,7 @@ add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search once, hide, print, write."""
+    """Diagnose the flights, compute the detection limits, print and write them."""
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place, write_json

@@ -1,4 +1,4 @@
-"""``visthrow diagnose check``: whether logs can answer anything, before a model is asked."""
+"""``visthrow diagnose check``: check logs for mistakes before they are diagnosed."""
 
 import argparse
 from dataclasses import asdict
@@ -10,15 +10,14 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, look, print."""
+    """Read the logs, check them, print and draw the results."""
     from visthrow.common.storage import write_json
     from visthrow.diagnose.inputs.setup import known, read_logs
     from visthrow.diagnose.reporting.log_picture import draw
     from visthrow.logs.check.run import check, table
 
-    logs = read_logs(
-        args.logs, args.config, models=("flyer",)
-    )  # whose cable and mass are looked at
+    # of the models, only the flyer states a cable and a mass to check
+    logs = read_logs(args.logs, args.config, models=("flyer",))
     results = check(logs, known(args.config, args.plant))
     for number, (log, checked) in enumerate(zip(logs, results), start=1):
         print(table(checked, args.all) + "\n")

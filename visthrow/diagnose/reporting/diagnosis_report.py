@@ -1,5 +1,5 @@
-"""The report of a diagnosis: one page with a sentence a finding, what it rests on and what to fly
-next; and the same as JSON.
+"""The report of a diagnosis, as text, page and JSON: a sentence for each finding, the evidence
+behind it, and which manoeuvres to fly next.
 """
 
 import dataclasses
@@ -22,11 +22,11 @@ from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.view.parts import Grid, Picture, Section, Text, section
 
 OPEN = (result.CLASS, result.NOT_IDENTIFIABLE)
-"""Verdicts that another flight may settle."""
+"""Verdicts that more flights can change."""
 
 
 def sentence_of(diagnosis: Diagnosis) -> str:
-    """The overall verdict in a sentence."""
+    """Return the overall verdict in a sentence."""
     where = f" in the {diagnosis.block}" if diagnosis.block else ""
     return f"{diagnosis.overall}{where}: {result.OVERALL[diagnosis.overall]}."
 
@@ -50,7 +50,7 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 
 
 def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]]:
-    """Return the findings, each with its verdict."""
+    """Return the statements of the report, each with its heading, such as a verdict."""
     moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
     measured = {m.effect: f"{m.name} (--measured {m.effect}={m.sd:g})" for m in MEASUREMENTS}
     statements = []
@@ -84,8 +84,8 @@ def _gain_line(c: ChannelGain) -> str:
 
 
 def _errors(c: ChannelGain) -> tuple[str, str, str, str, str]:
-    """Unit and errors of a channel as text: as it stands, with what was named, of noise alone, of
-    the black box if there is one.
+    """Return the unit of a channel and its prediction errors, all as text: of the original model,
+    with the selected effects, of noise alone, and of the black box, which is "" without one.
     """
     factor, unit = readable(c.unit)
     before, after, floor, box = (
@@ -96,12 +96,12 @@ def _errors(c: ChannelGain) -> tuple[str, str, str, str, str]:
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """A share in per cent, without sign where it is nothing."""
+    """Format a share in per cent; one that is rounded to 0 has no sign."""
     return f"{round(100 * share, digits) + 0.0:.{digits}f}"
 
 
 def landing_sentence(landing: LandingGain) -> str:
-    """Return a sentence on the model's predicted landings, in millimetres."""
+    """Return a sentence on the errors of the predicted landings, in millimetres."""
     mm = [1e3 * x for x in (landing.before, landing.after, landing.low, landing.high)]
     released = f"{1e3 * landing.released_before:.0f} to {1e3 * landing.released_after:.0f} mm"
     if not landing.moved:
@@ -121,8 +121,8 @@ def landing_sentence(landing: LandingGain) -> str:
 
 
 def _event(diagnosis: Diagnosis, flight: int) -> str:
-    """Return what happened in a flight: in one that was left out, one with a size of its own, or
-    one with a window far rougher than its phase.
+    """Describe an unusual flight: effects whose sizes differ from other flights', a window with far
+    stronger latent forces than its phase, or a disturbance for which the flight was left out.
     """
     differs = []
     for name, size in diagnosis.alone.items():
@@ -140,12 +140,12 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
 
 
 def instead(diagnosis: Diagnosis) -> list[str]:
-    """A line for each set of causes that says the same with several others; single ones that do are
-    reported as a class.
+    """Return a line for each possible set that differs from the selected one by more than one
+    effect; single alternatives are reported as a class.
     """
     lines: list[str] = []
     named = set(diagnosis.theta)
-    if not diagnosis.sets or set(diagnosis.sets[0][0]) != named:  # withdrawn for a law
+    if not diagnosis.sets or set(diagnosis.sets[0][0]) != named:  # effects were replaced by a law
         return lines
     for names, nats in diagnosis.sets:
         removed = sorted(named.difference(names))
@@ -164,7 +164,7 @@ def to_json(
     blind: Blind | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything the page says, for JSON, and the lines of :func:`summary`."""
+    """Return the contents of the page, with the lines of :func:`summary`, for JSON."""
     value = diagnosis.to_dict()
     value["summary"] = list(filter(None, summary(diagnosis, gain).splitlines()))
     for name, part in (("gain", gain), ("blind", blind)):
@@ -180,8 +180,10 @@ def sections(
     step_check: Mapping[str, float] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Section]:
-    """All sections of the page; ``step_check``: channel -> largest difference between the replay
-    and one with finer steps, in sigmas.
+    """Return all sections of the page.
+
+    ``step_check``: channel -> largest difference between the replay and one with finer steps, in
+    the sensor's standard deviations.
     """
     listed = [
         _verdict(diagnosis, gain),
@@ -231,7 +233,9 @@ def _residuals(diagnosis: Diagnosis) -> Section:
 
 
 def _gain(gain: Gain | None, named: Sizes) -> Section:
-    """Prediction errors; where nothing was named, only those of the model as it stands."""
+    """Return the section on prediction errors; if no effect was selected, only the original
+    model's.
+    """
     title = "Gain on flights that were not used"
     if gain is None:
         return section("gain", title)
@@ -306,7 +310,7 @@ def _laws(diagnosis: Diagnosis) -> Section:
 
 
 def _catalogue(diagnosis: Diagnosis) -> list[Section]:
-    """The effects, and which of them look alike."""
+    """Return the sections on the sizes of all effects and on the correlations between them."""
     rows = []
     for f in diagnosis.findings:
         sizes = (f"{f.estimate:.3g}" if f.estimate else "", f"{f.low:.3g}", f"{f.high:.3g}")
@@ -349,7 +353,7 @@ def _blind(blind: Blind | None, diagnosis: Diagnosis) -> Section:
 
 
 def _list_next_flights(diagnosis: Diagnosis) -> Section:
-    """Manoeuvres that the catalogue names for what stays open."""
+    """Return the section on the manoeuvres that the catalogue suggests for undecided effects."""
     serves: dict[str, list[str]] = {}
     for f in diagnosis.findings:
         for manoeuvre in f.manoeuvres if f.verdict in OPEN else ():

@@ -19,8 +19,8 @@ from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import page
 
-# exit status where no cause can be named: the data contradict themselves, or the simulation does
-# not follow them
+# exit status if no effect can be selected: the data contradict themselves, or the simulation fails
+# to follow them
 REFUSED = 1
 
 DIAGNOSIS = "diagnosis.json"  # in the report's folder; `diagnose apply` reads it
@@ -30,13 +30,13 @@ add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, search, print, write."""
+    """Diagnose the flights, print the summary, and write the report."""
     folder = Path(args.out)
     made_with = opening.made_with(args)
     check_place(folder / DIAGNOSIS)
     opened = opening.Opened(args)
     test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
-    (folder / DIAGNOSIS).unlink(missing_ok=True)  # of earlier flights, should this run stop
+    (folder / DIAGNOSIS).unlink(missing_ok=True)  # an interrupted run leaves no old result behind
     diagnosis = opened.diagnose(say=lambda line: print(line, flush=True))
     gained = None
     if args.no_report or diagnosis.work is None:
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace) -> int:
 def _test(
     test_flights: opening.Opened, diagnosis: Diagnosis
 ) -> dict[str, tuple[float, float, float]]:
-    """Return prediction errors of other flights by the model as its setup has it without
-    extensions, by that with all that was found, and of noise alone; print them.
+    """Return and print the prediction errors on unseen flights, by channel: of the setup's model
+    without extensions, of the model with all effects and laws that were found, and of noise alone.
     """
     checked = check(test_flights.logs, test_flights.known)
     for reason in contradictions(checked, test_flights.known.unread):
@@ -102,15 +102,16 @@ def write_report(
     limits: bool = True,
     made_with: Mapping[str, Any] | None = None,
 ) -> gain.Gain | None:
-    """Print the summary, write JSON, page, pictures and recording; returns the gain on held-out
-    flights.
+    """Print the summary, and write JSON, page, pictures and recording.
 
-    ``made_with``: see :func:`visthrow.diagnose.inputs.model_arguments.made_with`.
+    ``limits``: whether to compute the detection limits; ``made_with``: see
+    :func:`visthrow.diagnose.inputs.model_arguments.made_with`. Returns the gain on held-out
+    flights; None where no window can be predicted.
     """
     from visthrow.diagnose.reporting import recording
 
     gained = gain.measure(diagnosis, seed=seed)
-    # windows of one sample have nothing ahead that could be predicted
+    # windows of one sample have no later sample to predict
     measured = gained if gained.channels else None
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error()
@@ -121,7 +122,7 @@ def write_report(
         table = blackbox.unexplained(diagnosis.work.after, seed)
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
-    write_json(folder / DIAGNOSIS, whole)  # before pictures, which a full disk may refuse
+    write_json(folder / DIAGNOSIS, whole)  # first, because a full disk may prevent the pictures
     print("\n" + report.summary(diagnosis, measured))
     parts = report.sections(diagnosis, measured, hidden, step_check=steps, provenance=source)
     page.write(

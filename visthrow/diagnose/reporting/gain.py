@@ -1,8 +1,8 @@
-"""What the named causes are worth on flights that were not used to find them.
+"""The gain of a diagnosis: how much of the prediction error its effects remove on other flights.
 
-Each flight is left out in turn; the search is repeated on the others by their statistics, and its
-answer predicts the one left out. Beside it stand the noise floor, which cannot be beaten, and a
-black box trained on the same flights."""
+Each flight is held out in turn. The search is repeated on the statistics of the others, and the
+effects that it selects predict the held-out flight. The errors are compared with that of noise
+alone, which no model can beat, and with that of a black box trained on the same flights."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,40 +24,39 @@ from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 
 @dataclass(frozen=True)
 class LandingGain:
-    """The change of predicted landings by the named causes; lengths in metres, intervals of 95 % by
-    bootstrap over throws.
+    """Errors of predicted landings without and with the selected effects.
+
+    Lengths in metres; 95 % intervals by bootstrap over throws.
     """
 
     throws: int
-    held_out: bool  # whether each throw was predicted with causes sized by the other flights
-    # mean distance of prediction and measurement, open loop from before the throw, the model as it
-    # stands
+    held_out: bool  # whether each throw was predicted with sizes fitted to the other flights
+    # mean distance between predicted and measured landing, open loop from before the throw, of the
+    # original model
     before: float
-    after: float  # with what was named
-    low: float  # of ``after``
+    after: float  # the same with the selected effects
+    low: float  # interval of ``after``
     high: float
-    released_before: float  # the same from a state fitted up to the separation
+    released_before: float  # mean distance if predicted from a state fitted up to the separation
     released_after: float
-    moved: dict[
-        str, float
-    ]  # named effect -> mean distance by which it moves the predicted landings
-    # of each throw, prediction less measurement along world x and y, shape (throws, 2)
+    # selected effect -> mean distance by which it moves the predicted landings
+    moved: dict[str, float]
+    # predicted minus measured landing of each throw along world x and y, shape (throws, 2)
     off_before: ndarray
     off_after: ndarray
 
 
 @dataclass(frozen=True)
 class Gain:
-    """The worth of the named causes."""
+    """The gain of a diagnosis on held-out flights."""
 
     channels: tuple[ChannelGain, ...]
-    nats_per_sample: float  # of held-out log-likelihood
-    named_in: dict[str, float]  # effect -> share of folds that named it
+    nats_per_sample: float  # increase of the held-out log-likelihood
+    named_in: dict[str, float]  # effect -> share of folds that selected it
     folds: int
     left_out: str  # "flights", or "parts of flights"
-    landing: LandingGain | None  # where the model has throws whose landing was seen
-    # windows have no initial state that would have to be fitted first, and are predicted from end
-    # to end
+    landing: LandingGain | None  # None if no landing was measured
+    # whether windows are predicted as a whole, because they have no initial state to fit first
     whole: bool
 
     def __getitem__(self, channel: str) -> ChannelGain:
@@ -86,10 +85,10 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
 def landing_gain(
     work: Work, theta: Sizes, trained: Mapping[int, Sizes], seed: int
 ) -> LandingGain | None:
-    """Measure the change of predicted landings by the named causes.
+    """Measure how the selected effects change the errors of predicted landings.
 
-    ``trained``: flight -> their sizes by the other flights; empty where none were held out.
-    None where no landing was measured.
+    ``trained``: flight -> sizes fitted to the other flights; empty if no flights were held out.
+    Returns None if no landing was measured.
     """
     model = work.problem.model
     flown = sorted({w.flight for w in work.after.windows})
@@ -127,15 +126,16 @@ def landing_gain(
 
 @dataclass(frozen=True)
 class Tested:
-    """The errors of a diagnosed model on flights that nothing was estimated from."""
+    """Prediction errors of a diagnosed model on unseen flights."""
 
-    # channel -> root mean square error before and after, and of the sensors' noise and the initial
-    # state's uncertainty alone, in the channel's unit; every component counts alike
+    # channel -> root mean square errors in the channel's unit: of the original model, of the
+    # diagnosed one, and of sensor noise and the initial state's uncertainty alone; all components
+    # of a channel have equal weight
     errors: dict[str, tuple[float, float, float]]
     flights: int
     windows: int
     samples: int
-    outliers: int  # samples far outside, which weigh less as in the fit
+    outliers: int  # samples that get less weight, as in the fit
 
 
 def on_others(
@@ -145,14 +145,14 @@ def on_others(
     diagnosis: Diagnosis,
     without: Indices = (),
 ) -> Tested:
-    """Return prediction errors of flights that nothing was estimated from.
+    """Return the prediction errors on unseen flights.
 
     Args:
-        before: model of these flights that says what is worth it.
-        after: model of these flights that was diagnosed, with the laws that were found.
-        theta: sizes that were found.
-        diagnosis: that diagnosis, whose noise is taken.
-        without: flights that are left out.
+        before: original model of the unseen flights.
+        after: diagnosed model of the unseen flights, with the laws that were found.
+        theta: sizes of the effects that were found.
+        diagnosis: the diagnosis that found them; its noise levels are used.
+        without: numbers of the unseen flights to leave out.
     """
     work = diagnosis.work
     scale = np.array([diagnosis.sensor_scale[name] for name in after.channels])
@@ -172,8 +172,10 @@ def on_others(
 def _sum_weighted_squares(
     windows: Sequence[Window], problem: Problem, noise: Noise
 ) -> tuple[ndarray, int]:
-    """Return sums over the samples ahead of squared errors, of those expected of noise, and of
-    weights, shape (3, C), where samples far outside weigh less; and the number of these.
+    """Return weighted sums over the predicted samples, shape (3, C), and the number of outliers.
+
+    The sums are of squared errors, of the squared errors that noise alone would cause, and of the
+    weights; outliers have less weight.
     """
     count = len(noise.scale)
     sums = np.zeros((3, count))
@@ -194,8 +196,8 @@ def _sum_weighted_squares(
 
 
 def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> ndarray | None:
-    """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be
-    trained.
+    """Return the squared errors of the black box on held-out groups, shape (F, C, H); None if it
+    cannot be trained.
     """
     before = work.before
     table = table_of(before, rng)
@@ -216,7 +218,9 @@ def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> ndarray |
 
 
 def _nats(work: Work, cross: Crossed) -> float:
-    """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
+    """Return the increase of the held-out log-likelihood per sample; the models without and with
+    effects have noise levels of their own.
+    """
     plain = work.before.by_window.by(cross.groups)
     named = work.after.by_window.by(cross.groups)
     square = named.about(cross.trained).square

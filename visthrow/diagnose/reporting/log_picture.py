@@ -1,4 +1,4 @@
-"""One picture a log: its channels over time, gaps left open, with the verdicts beside them."""
+"""A picture of a log: its channels over time with gaps, and the verdict on each."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.view import style
 from visthrow.view.parts import png_of
 
-CHANNELS_DRAWN = 10  # channels in a picture
+CHANNELS_DRAWN = 10  # largest number of channels in a picture
 _FIRST = (
     "pos_w",
     "vel_w",
@@ -28,7 +28,7 @@ _SHADE = {"ok": style.COLOURS[2], "warn": style.COLOURS[4], "bad": style.COLOURS
 
 
 def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
-    """Write the picture."""
+    """Draw the channels of a checked log and write the picture."""
     ordered = dict.fromkeys((*_FIRST, *log.channels))
     names = [name for name in ordered if name in log and len(log[name].time) > 1][:CHANNELS_DRAWN]
     rows = max(len(names), 1)

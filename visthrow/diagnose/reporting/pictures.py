@@ -26,7 +26,7 @@ LOOKS = style.looks_of(tables_beside(__file__))
 """Part of a picture -> matplotlib's keywords."""
 REFERENCE = ("x [m]", "y [m]", "z [m]", "heading [deg]", "thrust [%]")
 REFERENCE += tuple(f"rate {axis} [rad/s]" for axis in "xyz")
-"""What is drawn of a reference, in the order of its columns."""
+"""Labels of the plotted columns of a reference."""
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
@@ -35,7 +35,7 @@ NAMES_ACROSS = 26  # letters in a line of a set's names
 
 
 def _add_legend(figure) -> bytes:
-    """Return the PNG of a figure, the labels of its first axes above it, each once."""
+    """Add the labels of a figure's first axes as a legend, and return the figure as a PNG."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     by_label = dict(zip(labels, handles))
     figure.legend(by_label.values(), by_label, loc="outside upper center", ncol=4, markerscale=2)
@@ -43,23 +43,23 @@ def _add_legend(figure) -> bytes:
 
 
 def _plain(axis, digits: Sequence[int] = (1,)) -> None:
-    """Label one axis of a picture with plain numbers, those of each decade that begin with these
-    digits, instead of powers of ten.
-    """
+    """Label a logarithmic axis with plain numbers instead of powers of ten.
+
+    ``digits``: leading digits of the labelled numbers in each decade."""
     axis.get_major_locator().set_params(subs=digits)
     axis.set_major_formatter("{x:g}")
     axis.set_ticks([], minor=True)
 
 
 def _name_rows(axis, names: Sequence[str], size: float) -> None:
-    """Write a name in letters of some size [pt] beside each row of a picture."""
+    """Label the rows of a picture with names; ``size``: of the font [pt]."""
     axis.set_yticks(range(len(names)), names, fontsize=size)
     axis.set_ylim(-1, len(names))
 
 
 def left_over(window: Window, noise: Noise) -> np.ndarray:
-    """Residuals with the initial state fitted to the whole window, in the channels' units, shape
-    (N,).
+    """Return the residuals after fitting the initial state to the whole window, in the channels'
+    units, shape (N,).
     """
     weight = 1.0 / (window.sigma * noise.scale[window.channel])
     states = window.nuisance * window.nuisance_sd * weight[:, None]
@@ -69,10 +69,9 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
 
 
 def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) -> bytes:
-    """Draw an optimised manoeuvre over the one that it began with, and what each manoeuvre
-    promises.
+    """Draw an optimised manoeuvre over its base manoeuvre, and the best manoeuvres' expected gain.
 
-    ``rates``: expected nats a second of manoeuvres by their name.
+    ``rates``: manoeuvre -> expected nats a second.
     """
     figure, axes = style.subplots(3, 3, (WIDTH, 6.2))
     for r, colour in ((base, style.BEFORE), (designed, style.AFTER)):
@@ -91,8 +90,8 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
 
 
 def residuals(work: Work, channel: int) -> bytes:
-    """Residuals of one channel before and after, laid over each other, in the windows where most
-    was gained, and in a usual one.
+    """Draw the residuals of a channel without and with the selected effects, in the windows that
+    improve most and in a typical one.
     """
     name = work.problem.model.channels[channel]
     factor, unit = readable(unit_of(name))
@@ -118,8 +117,8 @@ def residuals(work: Work, channel: int) -> bytes:
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
-    """Nats of each step's candidates, screened and with the simulation run again, and what they
-    must exceed; rows of three.
+    """Draw the gain of each step's candidates in evidence, by derivatives and after simulating
+    again, and the threshold; three steps a row.
     """
     steps = diagnosis.steps
     columns = min(len(steps), STEPS_ACROSS)
@@ -152,7 +151,7 @@ def _step(axis, step: SelectionStep) -> None:
 
 
 def verdicts(diagnosis: Diagnosis) -> bytes:
-    """Every effect's interval in its floors, by verdict."""
+    """Draw the interval of every effect in floors, coloured by verdict."""
     colours = {
         result.FOUND: style.AFTER,
         result.CLASS: style.COLOURS[3],
@@ -180,7 +179,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
 
 
 def horizons(gain: Gain) -> bytes:
-    """Prediction error over the horizon on held-out flights."""
+    """Draw the prediction error on held-out flights over the horizon."""
     figure, axes = style.subplots(1, len(gain.channels), (WIDTH, 2.9))
     for axis, channel in zip(axes[0], gain.channels):
         h, before, after, floor = np.array(channel.horizons).T
@@ -196,7 +195,7 @@ def horizons(gain: Gain) -> bytes:
 
 
 def landings(landing: LandingGain) -> bytes:
-    """Draw where each throw was predicted to land, relative to where it landed."""
+    """Draw the predicted landing of each throw relative to the measured one."""
     figure, axis = style.single((WIDTH, 3.6))
     before = 1e3 * landing.off_before
     after = 1e3 * landing.off_after
@@ -209,8 +208,8 @@ def landings(landing: LandingGain) -> bytes:
 
 
 def confusion(diagnosis: Diagnosis) -> bytes:
-    """Correlations of the effects' estimates with all of them free: what these flights cannot tell
-    apart.
+    """Draw the correlations of the effects' estimates with all effects free, which show what these
+    flights cannot separate.
     """
     work = diagnosis.work
     visible = np.flatnonzero(work.problem.priors.visible)
@@ -236,8 +235,8 @@ def confusion(diagnosis: Diagnosis) -> bytes:
 
 
 def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
-    """Sizes from which each hidden effect is named in half and in nine tenths of worlds, in floors;
-    open to the right if never.
+    """Draw the sizes from which each hidden effect is found in 50 % and in 90 % of worlds, in
+    floors, with an arrow to the right where 90 % is never reached.
     """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if len(c.sizes)]
     pairs.sort(key=lambda pair: np.nan_to_num(pair[0].limit / pair[1], nan=np.inf), reverse=True)

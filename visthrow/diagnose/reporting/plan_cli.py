@@ -1,5 +1,5 @@
-"""``visthrow diagnose plan``: the flight that determines most of what is undetermined, with its
-reference to fly.
+"""``visthrow diagnose plan``: rank the next flights by the evidence expected from them, and write
+their reference trajectories.
 """
 
 import argparse
@@ -14,7 +14,7 @@ add_arguments = declare(opening.__file__, __file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search, simulate the manoeuvres, optimise, rank, write."""
+    """Diagnose the flights, simulate and rank manoeuvres, optimise one, and write references."""
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace, value: dict[str, Any]) -> None:
-    """Write the plan, and settings of autopilots that sweep by themselves."""
+    """Write the plan, and the settings with which autopilots fly sweeps themselves."""
     from visthrow.common.storage import write_json
     from visthrow.diagnose.planning import manoeuvre_excitation as excitation
 

@@ -1,5 +1,5 @@
-"""The recording of a diagnosis for the rerun viewer: measured, simulated before and simulated
-after, flight by flight.
+"""The recording of a diagnosis for the rerun viewer: measured and simulated paths of each flight,
+without and with the selected effects.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,11 @@ PATHS = ("pos_w", "payload_pos_w")  # channels that are drawn in space
 
 
 def write(path: str | Path, diagnosis: Diagnosis, logs: Sequence[FlightLog]) -> None:
-    """Write a ``.rrd``: for each flight the measured paths, the ghosts of both models, and all
-    residuals over time.
+    """Write a ``.rrd`` file with the measured paths of each flight, the paths simulated without and
+    with the selected effects, and all residuals over time.
 
-    ``logs``: in the order in which the model numbers them; a model that numbers them otherwise gets
-    residuals alone.
-    Raises StorageError: the place cannot be written.
+    ``logs``: in the order of the model's flight numbers; where stamps do not match, only residuals
+    are written. Raises StorageError: the file cannot be written.
     """
     work = diagnosis.work
     with open_recording(path) as stream:
@@ -42,7 +41,7 @@ def _channel(
 ) -> None:
     rows = np.flatnonzero(before.channel == channel)
     time = before.time[rows]
-    width = np.count_nonzero(time == time[:1])  # components of a sample stand together
+    width = np.count_nonzero(time == time[:1])  # components of a sample are adjacent
     if not width or len(rows) % width:
         return
     stamps = time[::width]
