@@ -65,23 +65,32 @@ def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | 
     count = int((end - start) / period)
     if count < 50:
         return None
-    grid = start + period * np.arange(count)
     steps = int(reach / period)
-    relation, follows = _relate(first, second, grid, period, steps)
+    places = np.arange(count)
+    values = first.at(start + period * places)
+    around = second.at(start + period * np.arange(-steps, count + steps))
+    relation, follows = _relate(values, around, places, period, steps)
     if relation is not None and not np.all(follows):
-        relation, _ = _relate(first, second, grid[follows], period, steps)
+        relation, _ = _relate(values[follows], around, places[follows], period, steps)
     return relation
 
 
 def _relate(
-    first: Samples, second: Samples, grid: np.ndarray, period: float, steps: int
+    values: np.ndarray, around: np.ndarray, places: np.ndarray, period: float, steps: int
 ) -> tuple[Relation | None, np.ndarray]:
-    """Relation at the times of a grid [s], and which of them go with the rest."""
-    values = first.at(grid)
-    count = len(grid)
+    """Relation at some places of a grid, and which of them go with the rest.
+
+    Args:
+        values: of the first signal at the places, shape (N, A).
+        around: of the second on the grid, continued by the steps at both ends, shape (M, A).
+        places: numbers on the grid, shape (N,).
+        period: of the grid [s].
+        steps: by which the second is moved at most.
+    """
+    count = len(places)
     centred = values - np.mean(values, axis=0)
     values = values - np.median(values, axis=0)
-    usual = np.median(second.at(grid), axis=0)
+    usual = np.median(around[places + steps], axis=0)
     edges = np.linspace(0, count, BLOCKS, endpoint=False).astype(int)
     lags = 2 * steps + 1
     sums = np.zeros((2, lags, BLOCKS))
@@ -89,12 +98,12 @@ def _relate(
     norms = np.zeros(lags)
     power = np.sum(centred**2)
     for lag in range(lags):
-        moved = second.at(grid + (lag - steps) * period)
+        moved = around[places + lag]
         moved_centred = moved - np.mean(moved, axis=0)
         cross[:, :, lag] = centred.T @ moved_centred
         norms[lag] = np.sum(moved_centred**2)
         moved = moved - usual
-        products = np.sum(values * moved, axis=1), np.sum(moved**2, axis=1)
+        products = np.vecdot(values, moved), np.vecdot(moved, moved)
         sums[:, lag] = np.add.reduceat(products, edges, axis=1)
     follows = np.ones(count, bool)
     if power <= 0.0 or np.min(norms) <= 0.0:
