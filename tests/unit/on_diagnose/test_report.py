@@ -308,7 +308,7 @@ def test_where_nothing_was_named_no_error_with_names_is_given(diagnosed, measure
         (section,) = (
             s
             for s in report.sections(replace(diagnosed[1], theta=theta), measured)
-            if s.title == "Gain on flights that were not used"
+            if s.title == "Gain on held-out flights"
         )
         rows[bool(theta)] = section.parts[0].rows[0]
     assert rows[True][:3] == rows[False][:3]

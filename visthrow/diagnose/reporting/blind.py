@@ -93,7 +93,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
         shares = size * effect.floor, exact, similar, wrong
         curves.append(Completeness(effect.name, effect.unit, *shares, limit))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
-    source = "the flights' own residuals, with random signs a flight"
+    source = "residuals of the flights, with a random sign for each flight"
     if parametric:
         source = "drawn from its fitted level"
     return Blind(tuple(curves), alarms.mean(), 10 * draws, source)

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
     hidden = blind.hide(diagnosis, seed=args.seed)
-    print(f"smallest size named in 90 % of worlds; noise: {hidden.noise}")
+    print(f"smallest size found in 90 % of worlds; noise: {hidden.noise}")
     for curve in hidden.curves:
         print(f"  {curve.name:24} {curve.limit:10.3g} {curve.unit}")
     print(f"false alarms: {100 * hidden.false_alarms:.2f} % of {hidden.worlds} worlds")

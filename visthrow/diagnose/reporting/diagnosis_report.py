@@ -62,7 +62,7 @@ def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]
             text += f" It moves landings by {1e3 * moved[f.name]:.0f} mm."
         ways = [*f.manoeuvres, *(measured[n] for n in (f.name, *f.partners) if n in measured)]
         if f.partners and ways:
-            text += f" To tell them apart: {'; '.join(ways)}."
+            text += f" To separate them: {'; '.join(ways)}."
         statements.append((f.verdict, text))
     statements += [("OR", line) for line in instead(diagnosis)]
     statements += [("FOUND", m.sentence) for m in diagnosis.mistakes]
@@ -106,8 +106,8 @@ def landing_sentence(landing: LandingGain) -> str:
     released = f"{1e3 * landing.released_before:.0f} to {1e3 * landing.released_after:.0f} mm"
     if not landing.moved:
         return (
-            f"{landing.throws} throws, predicted open loop from before the throw, land {mm[0]:.0f}"
-            " mm off where they were seen to; from the separation on"
+            f"The mean landing error of {landing.throws} throws is {mm[0]:.0f} mm, predicted open"
+            " loop from before the throw; predicted from the separation, it is"
             f" {1e3 * landing.released_before:.0f} mm."
         )
     whose = "held-out throws" if landing.held_out else "the same throws"
@@ -115,8 +115,9 @@ def landing_sentence(landing: LandingGain) -> str:
     if round(mm[0]) == round(mm[1]):
         goes = f"stays at {mm[1]:.0f} mm"
     return (
-        f"With what was named the landing error of {landing.throws} {whose} {goes} [{mm[2]:.0f},"
-        f" {mm[3]:.0f}], open loop from before the throw; from the separation on {released}."
+        f"With the selected effects, the mean landing error of {landing.throws} {whose} {goes}"
+        f" [{mm[2]:.0f}, {mm[3]:.0f}], predicted open loop from before the throw; predicted from"
+        f" the separation, it goes from {released}."
     )
 
 
@@ -133,8 +134,8 @@ def _event(diagnosis: Diagnosis, flight: int) -> str:
         return f"flight {flight} differs from the others in {', '.join(differs)}"
     if flight in {w.flight for w in diagnosis.work.after.windows}:
         return (
-            f"a part of flight {flight} is far rougher than the rest of its phase, and has less"
-            " weight"
+            f"a window of flight {flight} has far stronger latent forces than others of its phase,"
+            " and has less weight"
         )
     return f"flight {flight} contains a disturbance that the others do not; it was left out"
 
@@ -236,7 +237,7 @@ def _gain(gain: Gain | None, named: Sizes) -> Section:
     """Return the section on prediction errors; if no effect was selected, only the original
     model's.
     """
-    title = "Gain on flights that were not used"
+    title = "Gain on held-out flights"
     if gain is None:
         return section("gain", title)
     rows = []
@@ -250,16 +251,17 @@ def _gain(gain: Gain | None, named: Sizes) -> Section:
     predicted = f"predictions from the first {HEAD_SECONDS:g} s of each window"
     note = (
         f"Root mean square errors of {'whole windows' if gain.whole else predicted},"
-        f" {gain.left_out} left out in {gain.folds} folds, the selection repeated in each"
-        f" ({', '.join(shares) or 'nothing in any'}). Interval: 95 %, by the scatter of flights."
-        f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
+        f" {gain.left_out} held out in {gain.folds} folds. Effects were selected again in each fold"
+        f" ({', '.join(shares) or 'none in any'}). Intervals: 95 %, from the variation between"
+        f" flights. Change of the log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
     )
     header = (
-        "channel | unit | as it stands | with what was named | less | noise alone | black box | "
+        "channel | unit | original model | with selected effects | reduction | noise alone |"
+        " black box | "
     )
     picture = None
     if any(len(c.horizons) > 1 for c in gain.channels):
-        over = "time in the window" if gain.whole else "horizon of the prediction"
+        over = "time in the window" if gain.whole else "prediction horizon"
         picture = Picture("horizons", pictures.horizons(gain), f"Error over the {over}.")
     grid = Grid.from_rows("Held-out prediction error", header, rows, note)
     return section("gain", title, grid, picture)
@@ -269,30 +271,31 @@ def _candidates(diagnosis: Diagnosis) -> Section:
     if not diagnosis.steps:
         return section("ladder", "Candidates")
     text = Text(
-        "Nats of evidence that each candidate would bring, or a set in place of the names"
-        " before; as a line what it must exceed; marks: with the simulation run again (circle:"
-        " taken, triangle: beaten)."
+        "Gain in evidence [nats] of each candidate, or of a set in place of the effects selected"
+        " before. Bars: by derivatives; marks: after simulating again (circle: selected, triangle:"
+        " rejected); line: the threshold."
     )
-    ladder = Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates.")
+    ladder = Picture("ladder", pictures.ladder(diagnosis), "Candidates of each step.")
     rows = [(", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets]
-    title = "Sets of causes that explain the flights as well"
+    title = "Possible sets of effects"
     sets = Grid.from_rows(title, "set | nats behind", rows if len(rows) > 1 else [])
     return section("ladder", "Candidates", text, ladder, sets)
 
 
 def _levels(diagnosis: Diagnosis) -> Section:
-    header = "what | phase | as it stands | with what was selected | times the quietest phase | "
+    header = "force | phase | original model | with selected effects | ratio to quietest phase | "
     rows = []
     for level in diagnosis.levels:
         sizes = (f"{level.before:.3g}", f"{level.after:.3g}", f"{level.after / level.quiet:.1f}")
-        excess = "more than gusts" if level.excessive else ""
+        excess = "stronger than gusts" if level.excessive else ""
         rows.append((level.block, level.phase, *sizes, excess))
     note = (
-        "Deviation of what moves the vehicle besides the model [N; N m]. Selected are causes and"
-        " laws, also those whose names were withdrawn. Gusts do not know the phase of the flight."
+        "Standard deviation of the forces [N] and torques [N m] that the model does not contain."
+        " Selected effects include laws, and effects that were withdrawn later. Gusts alone would"
+        " be equally strong in all phases."
     )
     grid = Grid.from_rows("Latent forces", header, rows, note, heads=2)
-    return section("levels", "Forces that nothing explains", grid)
+    return section("levels", "Unexplained forces", grid)
 
 
 def _laws(diagnosis: Diagnosis) -> Section:
@@ -302,10 +305,11 @@ def _laws(diagnosis: Diagnosis) -> Section:
             size = f"{law.coefficient:.4g} ± {law.sd:.2g}"
             rows.append((str(number), law.formula, law.block, size, law.unit, f"{law.nats:.1f}"))
     note = (
-        "Terms of one number act together; `apply --laws NUMBER` writes them. Nats over the same"
-        " causes without these terms, less the log of the number of terms as simple as they."
+        "Terms with the same number act together; `apply --laws NUMBER` writes them. Nats: gain in"
+        " evidence over the same effects without these terms, minus the log of the number of"
+        " equally simple terms."
     )
-    grid = Grid.from_rows("Terms", "number | law | on | c | unit | nats", rows, note, heads=3)
+    grid = Grid.from_rows("Terms", "number | law | acts on | c | unit | nats", rows, note, heads=3)
     return section("laws", "Laws outside the catalogue", grid)
 
 
@@ -320,18 +324,18 @@ def _catalogue(diagnosis: Diagnosis) -> list[Section]:
         )
     header = "effect | verdict | block | size | from | to | floor | unit | needs"
     meanings = [f"**{verdict}**: {meaning}." for verdict, meaning in result.VERDICTS.items()]
-    meanings.append("An interval is of the size that the effect has if it is present.")
+    meanings.append("An interval is for the size of the effect if it is present.")
     if diagnosis.overall == result.UNKNOWN:
-        meanings.append("Something unknown acts besides, which may shift these sizes.")
+        meanings.append("An unknown effect also acts, which may bias these sizes.")
     note = " ".join(meanings)
-    caption = "95 % intervals of all effects in their floors."
+    caption = "95 % intervals of all effects, in floors."
     intervals = Picture("verdicts", pictures.verdicts(diagnosis), caption)
     grid = Grid.from_rows("All effects", header, rows, note, heads=3)
     caption = "Correlation of the estimates with every effect free."
     alike = Picture("confusion", pictures.confusion(diagnosis), caption)
     return [
-        section("catalogue", "Every effect of the catalogue", intervals, grid),
-        section("confusion", "What looks alike", alike),
+        section("catalogue", "All effects of the catalogue", intervals, grid),
+        section("confusion", "Correlated effects", alike),
     ]
 
 
@@ -341,12 +345,12 @@ def _blind(blind: Blind | None, diagnosis: Diagnosis) -> Section:
         return section("blind", title)
     rows = [(c.name, "-" if np.isnan(c.limit) else f"{c.limit:.3g}", c.unit) for c in blind.curves]
     note = (
-        f"Size that would be named, up to its class, in 90 % of worlds; noise: {blind.noise}. False"
+        f"Size that would be found, up to its class, in 90 % of worlds; noise: {blind.noise}. False"
         f" alarms without a hidden effect: {100 * blind.false_alarms:.2f} % of {blind.worlds}"
         " worlds."
     )
     png = pictures.completeness(blind, [f.floor for f in diagnosis.findings])
-    picture = Picture("completeness", png, "Sizes from which hidden effects are named.")
+    picture = Picture("completeness", png, "Sizes from which hidden effects are found.")
     header = "effect | limit | unit"
     grid = Grid.from_rows("Detection limits in these flights", header, rows, note)
     return section("blind", title, picture, grid)
@@ -361,8 +365,8 @@ def _list_next_flights(diagnosis: Diagnosis) -> Section:
     ranked = sorted(serves.items(), key=lambda item: -len(item[1]))
     rows = [(manoeuvre, ", ".join(names)) for manoeuvre, names in ranked]
     note = (
-        "`visthrow diagnose plan` simulates them in these flights' model and ranks them by what"
-        " they would tell."
+        "`visthrow diagnose plan` simulates them with the diagnosed model and ranks them by"
+        " expected evidence."
     )
     grid = Grid.from_rows("Manoeuvres", "manoeuvre | would show or separate", rows, note)
     return section("plan", "What to fly next", grid)
@@ -371,7 +375,7 @@ def _list_next_flights(diagnosis: Diagnosis) -> Section:
 def _ground(
     diagnosis: Diagnosis, step_check: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> Section:
-    null = f"exceeded by the best of all effects in one of {1.0 / ALARM:.0f} null worlds"
+    null = f"exceeded by the best effect in one of {1.0 / ALARM:.0f} worlds without any effect"
     facts = {
         "flights, windows, samples": f"{diagnosis.flights}, {diagnosis.windows},"
         f" {diagnosis.samples}",
@@ -380,9 +384,9 @@ def _ground(
         "seconds": f"{diagnosis.seconds:.1f}",
     }
     for name, scale in diagnosis.sensor_scale.items():
-        facts[f"noise of {name} in what was stated"] = f"{scale:.2f}"
+        facts[f"noise of {name}, relative to the stated one"] = f"{scale:.2f}"
     for name, value in step_check.items():
-        facts[f"replay against finer steps, {name}"] = f"{value:.2g} sigma"
+        facts[f"difference from a replay with finer steps, {name}"] = f"{value:.2g} sigma"
     rows = [(str(key), str(value)) for key, value in {**facts, **provenance}.items()]
-    grid = Grid.from_rows("Numbers", "what | value", rows, heads=2)
-    return section("ground", "What this rests on", grid)
+    grid = Grid.from_rows("Numbers", "quantity | value", rows, heads=2)
+    return section("ground", "Basis of the diagnosis", grid)

@@ -78,14 +78,14 @@ def _test(
     print(
         f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
         f"flights;"
-        f" {tested.outliers} of {tested.samples} samples are outliers, which weigh less"
+        f" {tested.outliers} of {tested.samples} samples are outliers and have less weight"
     )
     for channel, channel_errors in tested.errors.items():
         factor, unit = readable(unit_of(channel))
         plain, named, floor = (factor * x for x in channel_errors)
         won = ""
         if plain > floor:
-            won = f", {(plain - named) / (plain - floor):.0%} of what is above it"
+            won = f", {(plain - named) / (plain - floor):.0%} of the excess over noise is removed"
         print(
             f"on the tested flights, {channel}: {plain:.3g} -> {named:.3g} {unit}, noise alone"
             f" {floor:.3g}{won}"

@@ -250,8 +250,8 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     axis.set(
         xscale="log",
         xlabel=(
-            "hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was"
-            " tried"
+            "hidden size [floors] found in 50 % and (mark) 90 % of worlds; >: at none of the tested"
+            " sizes"
         ),
     )
     _name_rows(axis, [curve.name for curve, _ in pairs], 7)

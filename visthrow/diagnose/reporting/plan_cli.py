@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     session = plan.session(ranked)
     if session:
         times = [p.name + f" x{p.repeats}" * (p.repeats > 1) for p in session]
-        print(f"together they settle the most: {', '.join(times)}")
+        print(f"flights that separate most together: {', '.join(times)}")
     extra = {
         "proposals": [dataclasses.asdict(p) for p in ranked],
         "session": [p.name for p in session],
@@ -82,7 +82,7 @@ def _write(args: argparse.Namespace, value: dict[str, Any]) -> None:
 
     write_json(Path(args.out) / "plan.json", value)
     sweeps = ", ".join(path.name for path in excitation.write(args.out))
-    print(f"references as CSV: {args.out}\nsweeps that autopilots fly by themselves: {sweeps}")
+    print(f"references as CSV: {args.out}\nsettings for sweeps flown by the autopilot: {sweeps}")
     if args.json:
         write_json(args.json, value)
 
