@@ -31,7 +31,7 @@ def list_units() -> list[dict[str, Any]]:
 def _list_by_target(throws: int) -> Iterator[dict[str, Any]]:
     for target in TARGETS:
         yield from thrower.units(thrower.IDEAL, "none", target, throws)
-    for compensation in reversed(thrower.MADE_UP):
+    for compensation in reversed(thrower.COMPENSATIONS):
         for target in TARGETS:
             yield from thrower.units("hybrid", compensation, target, throws)
 

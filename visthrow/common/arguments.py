@@ -195,7 +195,7 @@ class StopRequest:
     def __init__(self, signals: Sequence[int], message: str = ""):
         """Prepare for these signals; ``message``: printed on the first one."""
         self.asked = False
-        self._said = message
+        self._message = message
         self._signals = signals if threading.current_thread() is threading.main_thread() else ()
 
     def __enter__(self) -> "StopRequest":
@@ -210,5 +210,5 @@ class StopRequest:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        if self._said:
-            print(self._said, file=sys.stderr)
+        if self._message:
+            print(self._message, file=sys.stderr)

@@ -21,7 +21,7 @@ from visthrow.common.errors import StorageError
 MOST_UNPACKED = 256 << 20  # unpacked size that is always allowed [bytes]
 MOST_TIMES = 50  # allowed ratio of unpacked to packed size of a larger file; logs have 2 to 20
 PIECE = 1 << 20  # size of the pieces that are unpacked [bytes]
-SAY_EVERY = 3.0  # time between progress messages [s]
+PROGRESS_PERIOD = 3.0  # time between progress messages [s]
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
@@ -138,7 +138,7 @@ def count_lines(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
     for line in lines:
         yield line
         done += len(line)
-        if time.monotonic() - begin > SAY_EVERY:
+        if time.monotonic() - begin > PROGRESS_PERIOD:
             begin = time.monotonic()
             print(f"{name}: {done / length:.0%} read", file=sys.stderr, flush=True)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from visthrow.common.errors import VisthrowError
 
-LOOK = 0.5  # time between updates of the progress [s]
+POLL_PERIOD = 0.5  # time between updates of the progress [s]
 
 
 def status(text: str) -> None:
@@ -80,7 +80,7 @@ class Workers:
                 remaining = ""
             if self.label:
                 status(f"{self.label}: {100 * share:3.0f} %{remaining}")
-            for end in wait(busy, LOOK):
+            for end in wait(busy, POLL_PERIOD):
                 try:
                     index, result = end.recv()
                 except EOFError:

@@ -31,9 +31,10 @@ from visthrow.onboard.observations import rotation_from_quat
 
 HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
 
-SURE = 0.5  # lowest share of the pictures in a hover in which ball and goal must be detected
+# lowest share of the pictures in a hover in which ball and goal must be detected
+LEAST_DETECTED = 0.5
 
-THINGS = ("ball", "goal")  # objects to detect
+OBJECTS = ("ball", "goal")  # objects to detect
 
 
 def render_hall(
@@ -115,7 +116,7 @@ class RenderedEyes:
         self.frames: list[tuple[ndarray, Tensor, Tensor]] = []
         self.last_keypoints: tuple[ndarray, ndarray] | None = None
         # number of pictures of each vehicle in which the object was detected
-        self._hits = {name: np.zeros(count, int) for name in THINGS}
+        self._hits = {name: np.zeros(count, int) for name in OBJECTS}
         self._refused = 0
 
     @property
@@ -162,8 +163,8 @@ class RenderedEyes:
         """
         lost = {
             int(e): name
-            for name in THINGS
-            for e in np.flatnonzero(self._hits[name] < SURE * self._looks)
+            for name in OBJECTS
+            for e in np.flatnonzero(self._hits[name] < LEAST_DETECTED * self._looks)
         }
         self._refused = len(lost)
         return lost
@@ -192,7 +193,7 @@ class RenderedEyes:
         distance = HANGING if carried else None
         prior = self._followed[e].prior(rot_wc, rot_wb[:, 2], eye_w, distance, stamp)
         detections = self.detector.detect(picture, prior)
-        for name in THINGS:
+        for name in OBJECTS:
             self._hits[name][e] += getattr(detections, name) is not None
         return self._followed[e].take(detections, rot_wc, stamp)
 

@@ -333,7 +333,7 @@ class DiagnosedParams(Bounded):
 
 @dataclass(frozen=True)
 class Experiment:
-    """The complete configuration of a training run; written beside its results."""
+    """The complete configuration of a training run, which is written with its results."""
 
     vehicle: VehicleParams
     rope: RopeParams

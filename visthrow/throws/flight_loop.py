@@ -24,7 +24,7 @@ from visthrow.throws.plants import Plant, Snapshot
 FALL_TIME = 1.5
 """Longest flight of a payload before its throw counts as failed [s]."""
 
-LOOK_EVERY = 8
+PICTURE_PERIOD = 8
 """Control periods between pictures in a hover."""
 
 VIEWS = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w")
@@ -137,7 +137,7 @@ class Policies(Pilots):
 
     def wait(self, flight: "Flight", snapshot: Snapshot) -> dict[int, str]:
         self._waited += 1
-        if self.eyes is not None and self._waited % LOOK_EVERY == 0:
+        if self.eyes is not None and self._waited % PICTURE_PERIOD == 0:
             self.eyes.look(flight.plant.exposed, snapshot, self.goal_w, snapshot.attached)
             self._lost = {
                 e: f"refused: the {name} is not seen in the hover"

@@ -180,7 +180,7 @@ class HybridPlant:
             elif rope is None and separated[e]:
                 separation_time = float(self._sim.get("separation_time")[e])
                 self._separation[e] = self.time + separation_time
-                loose = self._let_go(e)
+                loose = self._make_loose_rope(e)
                 if self.period - separation_time > 1e-6:
                     loose.fly(self.period - separation_time)
                 self._ropes[e] = loose
@@ -231,7 +231,7 @@ class HybridPlant:
         action = action + torch.from_numpy(self._command_bias + noise)
         return act.command_from_action(action, max_thrust, rates).numpy()
 
-    def _let_go(self, e: int) -> LooseRope:
+    def _make_loose_rope(self, e: int) -> LooseRope:
         """Return the rope of one plant at separation; the simulator keeps the directions and rates
         of this instant.
         """

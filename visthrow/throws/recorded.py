@@ -143,16 +143,16 @@ def fly(
     recording = ThrowRecorder(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
 
-    def hangs_still(snapshot: Snapshot) -> bool:
+    def is_quiet(snapshot: Snapshot) -> bool:
         return _speed(snapshot.payload_vel_w) < QUIET_SPEED
 
-    def let_go(flight: Flight) -> bool:
+    def has_separated(flight: Flight) -> bool:
         return not np.any(flight.open & flight.now.attached)
 
-    flight.run([_hover_until(hangs_still, home, HOVER_LEAST, HOVER_MOST), Phase(True, let_go)])
+    flight.run([_hover_until(is_quiet, home, HOVER_LEAST, HOVER_MOST), Phase(True, has_separated)])
     recovery = plant.time
 
-    def has_recovered(snapshot: Snapshot) -> bool:  # the payload lies on the ground or hangs still
+    def has_recovered(snapshot: Snapshot) -> bool:  # and the payload is on the ground or at rest
         at_rest = plant.landing.landed[0] or snapshot.attached[0]
         return _speed(snapshot.vel_w) < QUIET_SPEED and bool(at_rest)
 

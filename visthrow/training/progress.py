@@ -30,7 +30,7 @@ COLUMNS = (
     "landed_2m",
 )
 
-SAID_EVERY = 25  # iterations between two lines
+PRINT_PERIOD = 25  # iterations between two lines
 
 
 class TrainLog:
@@ -107,7 +107,7 @@ class TrainLog:
                 f"  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s,"
                 f" landed {100 * figures['landed_2m']:.1f} %"
             )
-        if throws is not None or figures["iteration"] % SAID_EVERY == 0:
+        if throws is not None or figures["iteration"] % PRINT_PERIOD == 0:
             print(text, flush=True)
 
     def _estimate_remaining(self, iteration: int, elapsed: float) -> float:

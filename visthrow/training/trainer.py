@@ -42,7 +42,7 @@ ADAPTATION = 'ppo="ppo/adapt.toml"'
 
 EVALUATED = 200  # throws in an evaluation
 EVALUATION_SEED = 12345  # seed of its starts and noise
-FINAL = 5  # the evaluation at the end of a training has so many times more throws
+FINAL = 5  # factor on the number of throws in the evaluation at the end of a training
 
 TASK = ("observation", "action", "control_period")
 """Parts of a policy's contract on which its network depends; plant, camera and release may differ

@@ -20,7 +20,7 @@ def test_compare_shows_the_baseline_under_each_condition(tmp_path, capsys, one_s
     assert [row["policy"] for row in rows] == [
         "state",
         title,
-        *(thrower.title_of("hybrid", c) for c in thrower.MADE_UP),
+        *(thrower.title_of("hybrid", c) for c in thrower.COMPENSATIONS),
     ]
     printed = capsys.readouterr().out
     (line,) = [line for line in printed.splitlines() if title in line]

@@ -80,7 +80,7 @@ def test_difference_of_vision_has_the_right_sign():
     far = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.05)
     (row,) = grids(throws.vision_section(only(near, far)))[0].rows
     assert row[3].startswith("-0.0")
-    assert row[4] == "vision nearer"
+    assert row[4] == "vision is better"
     assert row[6] == "-0.004, -0.029"
 
 

@@ -57,7 +57,7 @@ def test_what_unpacks_to_too_much_is_not_read(name, tmp_path, monkeypatch):
 
 
 def test_a_long_read_says_how_far_it_is(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(storage, "SAY_EVERY", -1.0)
+    monkeypatch.setattr(storage, "PROGRESS_PERIOD", -1.0)
     path = tmp_path / "x.csv"
     path.write_text("a,b\n" + "1,2\n" * 3)
     read_table(path)

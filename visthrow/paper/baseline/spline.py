@@ -74,7 +74,7 @@ DIFFERENCE = 1e-6  # finite-difference step, in m and in logarithms of time
 # evaluations of the objective at each duration, starting from the previous duration's path
 EVALUATIONS = 100
 
-HOPELESS = 2.0  # ratio of the objective to the best one at which the search stops
+STOP_RATIO = 2.0  # ratio of the objective to the best one at which the search stops
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
 
 def _descend(improve, x: ndarray, totals: ndarray) -> tuple[float, float, ndarray]:
     """Return the best path of a series with decreasing durations, each optimised from the previous
-    one, until the objective is :data:`HOPELESS` times the best.
+    one, until the objective is :data:`STOP_RATIO` times the best.
 
     Starting from a long path avoids the local optima of short paths in which the vehicle
     inverts."""
@@ -299,7 +299,7 @@ def _descend(improve, x: ndarray, totals: ndarray) -> tuple[float, float, ndarra
         x, value = improve(x, float(total))
         if value < best[0]:
             best = (value, float(total), x)
-        elif value > HOPELESS * best[0]:
+        elif value > STOP_RATIO * best[0]:
             break
     return best
 

@@ -25,10 +25,10 @@ IDEAL = (  # the controller's model, in addition to :data:`visthrow.throws.plant
     "pendulum"
 )
 
-MADE_UP = {
-    "none": "nothing made up for",
-    "delay": "all delays but the release's lag made up for",
-    "both": "all delays made up for",
+COMPENSATIONS = {
+    "none": "no delays compensated",
+    "delay": "all delays except the release's lag compensated",
+    "both": "all delays compensated",
 }
 """Compared compensation -> description; see :func:`visthrow.paper.baseline.fly_plan.delays_of`."""
 
@@ -40,7 +40,9 @@ _experiment = cache(load_experiment)
 
 def title_of(plant: str, compensation: str) -> str:
     """Return a row's name with plant and compensation."""
-    return "TO+MPC, own model (ideal)" if plant == IDEAL else f"TO+MPC, {MADE_UP[compensation]}"
+    return (
+        "TO+MPC, own model (ideal)" if plant == IDEAL else f"TO+MPC, {COMPENSATIONS[compensation]}"
+    )
 
 
 def unit(
@@ -63,7 +65,7 @@ def unit(
 
     Args:
         plant: :data:`IDEAL`, or a name in :data:`visthrow.throws.plants.PLANTS`.
-        compensation: name in :data:`MADE_UP`; "none" in the controller's model.
+        compensation: name in :data:`COMPENSATIONS`; "none" in the controller's model.
         target: distance [m]. throws: number of throws. seed: seed of initial states and noise.
         height, speed: height [m] and speed [m/s] of the payload at release; default those of the
             learnt policy.
@@ -153,7 +155,10 @@ def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
     """Return plant and compensation of a table's rows: the controller's model, and each plant with
     each compensation.
     """
-    return [(IDEAL, "none"), *((plant, made_up) for plant in plants for made_up in MADE_UP)]
+    return [
+        (IDEAL, "none"),
+        *((plant, compensation) for plant in plants for compensation in COMPENSATIONS),
+    ]
 
 
 def fly_units(

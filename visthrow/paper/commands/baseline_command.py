@@ -58,10 +58,10 @@ def run(args: argparse.Namespace) -> int:
             {
                 "heading": SHORT[plant],
                 "plant": plant,
-                "kinds": [(made_up, bounds)],
+                "kinds": [(compensation, bounds)],
                 "policies_on": "hybrid",
             }
-            for plant, made_up in kinds
+            for plant, compensation in kinds
         ]
         names = [result.unit["policy"] for result in policies]
         document.append(
@@ -111,12 +111,12 @@ def _list_sweep_units(args: argparse.Namespace, bounds: str) -> Iterator[list[di
     speeds, weights = ((2.2,), front.WEIGHTS[2::2]) if args.quick else (front.SPEEDS, front.WEIGHTS)
     for speed in speeds:
         for w_t, rho in weights:
-            for plant, made_up in [
+            for plant, compensation in [
                 (thrower.IDEAL, "none"),
                 *((plant, "both") for plant in args.plants),
             ]:
                 how = {"speed": speed, "w_t": w_t, "rho": rho, **_describe(args, bounds)}
-                yield thrower.units(plant, made_up, front.FRONT_TARGET, args.throws, **how)
+                yield thrower.units(plant, compensation, front.FRONT_TARGET, args.throws, **how)
 
 
 def _releases(args: argparse.Namespace) -> dict[float, tuple[float, float]]:

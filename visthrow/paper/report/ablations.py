@@ -25,8 +25,8 @@ PAPER_THROWS = 5
 PAPER_FULL_THROWS = 10
 
 NOTE = (
-    "Scatter: root mean square distance from the mean landing point of all trainings; what is left"
-    " of the error is bias. The paper's interval is ours, from its deviations and numbers of"
+    "Scatter: root mean square distance from the mean landing point of all trainings; the rest of"
+    " the error is bias. We computed the paper's interval from its deviations and numbers of"
     " throws."
 )
 
@@ -47,13 +47,13 @@ def section(thrown: ResultSet) -> Section:
     sentence on each component.
     """
     lead = Text(
-        "Each policy was trained with one component of the simulator removed and otherwise the same"
-        " recipe, then flown without retraining on the full reference plants at 2.0 m: other code"
-        " and noise, the same equations, so that policies land nearer there than in training. They"
-        " stand in for a vehicle and are none. The ratio is its mean landing error over that of the"
-        " full model trained alike; intervals draw trainings first and throws within them where"
-        " there are several trainings (seeds). The paper's ratios come from five throws a variant"
-        " of a real vehicle."
+        "Each policy was trained with one component of the simulator removed and otherwise in the"
+        " same way, then flown without retraining on the full reference plants at 2.0 m. These have"
+        " other code and noise but the same equations, so errors are smaller than in training. They"
+        " are stand-ins for a vehicle, not vehicles. The ratio is its mean landing error over that"
+        " of the full model. With several trainings (seeds), intervals draw first trainings and"
+        " then throws within them. The paper's ratios come from five throws of a real vehicle for"
+        " each variant."
     )
     grids = []
     marks = []
@@ -137,14 +137,14 @@ def _sentence(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
     elif ratio.value > 1.0:
         verdict = "the component matters"
     else:
-        verdict = "leaving it out did not harm, it helped"
+        verdict = "the policy is better without it"
     bias = st.bias([r.miss for r in trainings])
     text = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error: {verdict}"
     signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
     paper = paper_ratio(variant)
     if paper is not None:
         distinct = paper.low > ratio.high or paper.high < ratio.low
-        agree = "apart from ours" if distinct else "the intervals overlap"
+        agree = "the intervals do not overlap" if distinct else "the intervals overlap"
         text += f"; the paper: {paper.text(2)}, {agree}"
         signs += f"; the paper's throws: {PAPER_ABLATIONS[variant][4]}"
     if len(trainings) == 1:
@@ -166,7 +166,7 @@ def _scatter(thrown: ResultSet) -> Picture | None:
     if len(panels) < 2:
         return None
     text = (
-        f"Landing points of state policies on the {SHORT[plant]} at {TARGET:.1f} m, a colour a"
-        " training; large marks: means. Above the target is too far."
+        f"Landing points of state policies on the {SHORT[plant]} at {TARGET:.1f} m, one colour for"
+        " each training; large marks: means. Points above the target are too far."
     )
     return Picture("ablation_scatter", figures.scatter(panels, 4), text)

@@ -30,8 +30,8 @@ TITLES: dict[str, str] = WORDS["beyond"]
 def section(thrown: ResultSet) -> Section:
     """Return the section on moving targets, varied payloads, drag and far targets."""
     lead = Text(
-        "Each is a switch of the task's config, off by default. Policies trained with it stand"
-        " beside those trained without."
+        "Each is a switch of the task's config, off by default. Policies trained with it are"
+        " compared with those trained without."
     )
     rows = []
     missing = []
@@ -51,7 +51,7 @@ def section(thrown: ResultSet) -> Section:
     header = (
         "policy | training | plant | flown with | target [m] | throws | landed | landing error [m]"
     )
-    note = "'its own': the conditions of its own training; else what was changed."
+    note = "'its own': the conditions of its own training; otherwise the changes."
     table = Grid.from_rows("Payload, drag and distance", header, rows, note, heads=4)
     return parts.section("beyond", "Beyond the paper", lead, *moving, table, missing=missing)
 
@@ -160,8 +160,8 @@ def training_section(thrown: ResultSet) -> Section:
     picture = None
     if groups:
         text = (
-            "Landing error of the training's own throws, random starts and goals, over environment"
-            " steps; a colour a seed."
+            "Landing error in training, with random starts and goals, over environment steps; one"
+            " colour for each seed."
         )
         picture = Picture("learning", charts.draw_learning(list(groups.items())), text)
     header = (
@@ -216,10 +216,10 @@ def origin_section(thrown: ResultSet) -> Section:
         days = " to ".join(dict.fromkeys((times[0], times[-1])))
         rows.append((*origin, str(len(records)), str(throws), seeds, days, f"{seconds:.0f}"))
     lead = Text(
-        "Seeds of throws fix starts, vehicles, winds and noise: policies and baseline meet the same"
-        " ones. Intervals are percentile bootstrap intervals of 95 %; 'runs and throws' are drawn"
-        " in two levels where there are several trainings. Throws that did not land have no error"
-        " and count against 'landed'."
+        "Seeds of throws determine starts, vehicles, winds and noise, which are the same for"
+        " policies and baseline. Intervals are percentile bootstrap intervals of 95 %; with several"
+        " trainings, runs and throws are drawn in two levels. Throws that did not land have no"
+        " error and lower 'landed'."
     )
     header = "command | commit | plant | sets | throws | seeds | made on | seconds of work"
     table = Grid.from_rows("Throws behind this page", header, rows, heads=3)

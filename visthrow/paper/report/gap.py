@@ -65,9 +65,8 @@ def section(thrown: ResultSet) -> Section:
     content = [
         Text(
             "The shipped policies are flown in the training simulator at 2.0 m with one value"
-            " changed and everything else as it is flown. Nothing is retrained. `vision` saw late,"
-            " lost and wrong keypoints in its training. Rings mark the policies' own value, bands"
-            " are 95 % intervals over throws."
+            " changed. Nothing is retrained. `vision` was trained with late, lost and wrong"
+            " keypoints. Rings mark the policies' own value, bands are 95 % intervals over throws."
         )
     ]
     if rows:
@@ -135,12 +134,12 @@ def _list_trained(thrown: ResultSet, missing: list[str]) -> list:
         return []
     header = "trained with | plant | trainings | landed | landing error [m] | ratio to full"
     text = (
-        "Vision policies trained with other sight; 95 % intervals, over throws alone where there is"
-        " one training."
+        "Vision policies trained with different vision; 95 % intervals, only over throws if there"
+        " is one training."
     )
     axis = "landing error at 2.0 m [m]"
     picture = charts.marks(marks, axis, [SHORT[plant] for plant in plants])
     return [
         Picture("gap_trained", picture, text),
-        Grid.from_rows("Trained with other sight", header, rows),
+        Grid.from_rows("Trained with different vision", header, rows),
     ]

@@ -31,9 +31,9 @@ def throws_section(thrown: ResultSet) -> Section:
         elif is_reported(plant, target):
             missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
     lead = Text(
-        "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
-        " 2.5 m (`vision`): for the first 2.5 m is out of distribution. The training simulator has"
-        " all noise of the training; the reference plants were never seen in it."
+        "Throws of the shipped policies from hover. In training, goals were within 2 m (`state`)"
+        " and 2.5 m (`vision`); for the first 2.5 m is out of distribution. The training simulator"
+        " has all noise of the training; the reference plants were not used in it."
     )
     header = (
         f"policy | target [m] | plant | throws | landed | {ERROR} | deviation [m] | duration [s]"
@@ -114,9 +114,9 @@ def vision_section(thrown: ResultSet) -> Section:
         marks.append(charts.Mark(f"{target:.1f} m", gap, i, reference))
     parts = [
         Text(
-            "Vision minus state: positive means that vision lands further off. Where several"
-            " trainings of both are recorded, the interval covers trainings and throws; else it"
-            " speaks of the two shipped policies alone, throw by throw: both met the same vehicles,"
+            "Vision minus state: a positive value means that vision has a larger error. If several"
+            " trainings of both are recorded, the interval covers trainings and throws. Otherwise"
+            " it refers to pairs of throws of the two shipped policies, with the same vehicles,"
             " starts and winds."
         )
     ]
@@ -127,7 +127,7 @@ def vision_section(thrown: ResultSet) -> Section:
         )
         axis = "landing error, vision minus state [m]"
         picture = charts.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
-        text = "Difference of mean landing errors with 95 % intervals; left: vision lands nearer."
+        text = "Difference of mean landing errors with 95 % intervals; left: vision is better."
         parts += [
             Grid.from_rows("Vision against state", header, rows),
             Picture("vision", picture, text),
@@ -180,4 +180,4 @@ def _paper(target: float) -> tuple[st.Interval, float] | None:
 def _sentence(gap: st.Interval) -> str:
     if 0.0 in gap:
         return "no difference shows"
-    return "vision further off" if gap.value > 0.0 else "vision nearer"
+    return "vision is worse" if gap.value > 0.0 else "vision is better"

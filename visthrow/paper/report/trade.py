@@ -53,18 +53,20 @@ def baseline_section(thrown: ResultSet) -> Section:
     rows = []
     missing = []
     for target in TARGETS:
-        for plant, made_up in thrower.rows(("hybrid", "reference-realistic")):
-            best = _best(thrown, plant, target, made_up)
+        for plant, compensation in thrower.rows(("hybrid", "reference-realistic")):
+            best = _best(thrown, plant, target, compensation)
             if best:
                 rows.append(best)
-            elif plant != "reference-realistic" or made_up != "none":
-                missing.append(f"{SHORT[plant]}, {thrower.MADE_UP[made_up]}, {target:g} m")
+            elif plant != "reference-realistic" or compensation != "none":
+                missing.append(
+                    f"{SHORT[plant]}, {thrower.COMPENSATIONS[compensation]}, {target:g} m"
+                )
     lead = Text(
         "Trajectory optimisation and model-predictive control (TO+MPC), as the paper's: release"
         " height and speed from the learnt policy, a septic spline, a nonlinear MPC on a rigid"
         " pendulum. In its own model it is an idealised bound, without delay, noise, release lag or"
         " aerodynamics. On the plants it flies the same throws as the policies, with none, most or"
-        " all of the known delays made up for."
+        " all of the known delays compensated."
     )
     tables = [target_table(rows), Text(_bar(thrown), "finding")] if rows else []
     return parts.section(
@@ -99,7 +101,7 @@ def target_table(results: Sequence[Result]) -> Grid | None:
     model.
     """
     header = (
-        "target [m] | plant | made up for | throws | landed | landing error [m] | duration [s]"
+        "target [m] | plant | compensation | throws | landed | landing error [m] | duration [s]"
         f" | e_p [cm] | e_v [cm/s] | tracking [cm] | {MODEL}"
     )
     note = (
@@ -123,7 +125,7 @@ def _row(result: Result) -> dict[str, str]:
     if unit["plant"] == thrower.IDEAL:
         row[MODEL] = format_paper_result("TO+MPC", unit["target"])
     else:
-        row["made up for"] = thrower.MADE_UP[unit["compensation"]]
+        row["compensation"] = thrower.COMPENSATIONS[unit["compensation"]]
     if result.good.any():
         row |= {head: f"{100 * result.of(name).mean():.1f}" for name, head in PARTS.items()}
     return row
@@ -177,15 +179,15 @@ def front_section(
     panels = [_panel(thrown, names, sentences, sums, missing, **row) for row in rows_of_panels]
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting"
-        " counts where all its throws landed. Plans bound the payload's path alone, as the paper's"
-        " do, or the vehicle's thrust and its turning as well. Lines join the settings that no"
-        " other one of their kind beats; stars are the learnt policies with 95 % intervals."
+        " counts if all its throws landed. Plans bound only the payload's path, as in the paper, or"
+        " also the vehicle's thrust and its rotation. Lines join the settings that no other setting"
+        " of their kind dominates; stars are the learnt policies with 95 % intervals."
     )
     if any(len(points) for panel in panels for _, _, points in panel.fronts):
         text = (
-            "Agility against accuracy, nearer to the lower left corner is better. On the plants the"
-            " baseline's known delays are made up for, except where the legend says otherwise."
-            " Crosses and grey stars are the paper's."
+            "Agility against accuracy; closer to the lower left corner is better. On the plants the"
+            " baseline's known delays are compensated, unless the legend states otherwise. Crosses"
+            " and grey stars are the paper's."
         )
         picture = Picture("front", charts.trades(panels), text)
     header = (
@@ -194,7 +196,7 @@ def front_section(
     )
     time, error = front.CORNER
     note = (
-        f"Hypervolume: area that is beaten up to {time:g} s and {error:g} m; more is better."
+        f"Hypervolume: area that is dominated up to {time:g} s and {error:g} m; more is better."
         " Correlations are over throws of all settings; the paper states that the error follows"
         " e_v."
     )
@@ -238,10 +240,10 @@ def _panel(
             _find_baseline(thrown, plant, compensation=compensation, bounds=bounds)
         )
         label = f"TO+MPC, bounds on {bounds}"
-        late = ", release lag not made up for" if compensation == "delay" else ""
+        late = ", release lag not compensated" if compensation == "delay" else ""
         entry = (i, label + late, points_of(selected))
         if not ideal:
-            label += f", {thrower.MADE_UP[compensation]}"
+            label += f", {thrower.COMPENSATIONS[compensation]}"
         if selected:
             fronts.append(entry)
             sums.append(_summarise(title, label, selected))

@@ -32,9 +32,9 @@ from visthrow.training.env import ThrowEnv
 
 # standard deviation of random actions about hover; three times these values saturate the motors of
 # a heavy vehicle, and the fitted thrust then responds to its command by only a fifth
-EXCITED = (0.1, 0.15, 0.15, 0.15, 0.0)
-RETAINED = 0.7  # correlation of successive random actions
-FITTED = 8000  # steps of flight for the fit
+ACTION_SPREAD = (0.1, 0.15, 0.15, 0.15, 0.0)
+CORRELATION = 0.7  # correlation of successive random actions
+FIT_STEPS = 8000  # steps of flight for the fit
 TAUT = 0.1  # tension above which the rope counts as taut, in weights of the payload
 
 STATES = ("pos", "vel", "quat", "load_pos", "load_vel", "response")
@@ -162,14 +162,16 @@ def fit(flights: FlightBatch) -> dict[str, Tensor]:
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
     parts = []
     hover = env.previous_action.clone()
-    spread = hover.new_tensor(EXCITED)
+    spread = hover.new_tensor(ACTION_SPREAD)
     swing = torch.randn_like(hover) * spread
 
     def act(k: int, obs: Tensor) -> Tensor:
-        swing.mul_(RETAINED).add_((1.0 - RETAINED**2) ** 0.5 * spread * torch.randn_like(swing))
+        swing.mul_(CORRELATION).add_(
+            (1.0 - CORRELATION**2) ** 0.5 * spread * torch.randn_like(swing)
+        )
         return hover + swing
 
-    for _ in range(FITTED // flights.obs[..., 0].numel() + 1):
+    for _ in range(FIT_STEPS // flights.obs[..., 0].numel() + 1):
         flights.fly(act)
         parts.append(_regressors(flights, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
