@@ -448,7 +448,7 @@ def findings(
         size = labels["sizes", kind]
         visible = labels["visible", kind]
         hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
-        # neither correct nor near the object, which may be partly in view
+        # not near an object that may be partly in view
         clear = visible | (error > 2.0 * size)
         if kind == "goal":
             first = corners_of(views, out)[:, 0:1]

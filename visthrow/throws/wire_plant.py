@@ -16,8 +16,8 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant, random_ropes
 
 MECHANISM = 0.06
-"""Time from the trip of the latch to separation with a real firmware [s]: a quick servo, so that
-this and the firmware's delay together fit the lag with which the policies were trained.
+"""Time from the trip of the latch to separation with a firmware in the loop [s]: a fast servo, so
+that this and the firmware's delay together fit the lag with which the policies were trained.
 """
 
 # share of the weight at which the thrust lifts a vehicle off its stand; a hover controller commands
