@@ -1,1 +1,1 @@
-"""Extension of a configuration by a diagnosis."""
+"""Extending a configuration by the effects and laws that a diagnosis found."""

@@ -1,4 +1,4 @@
-"""``visthrow diagnose apply``: write the extended configuration that a diagnosis asks for."""
+"""``visthrow diagnose apply``: write the configuration extended by a diagnosis."""
 
 import argparse
 from pathlib import Path
@@ -16,7 +16,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the file."""
+    """Write the extended configuration, or that of a blackbox's firmware."""
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.apply import patch
     from visthrow.diagnose.apply.saved_diagnosis import SavedDiagnosis
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         else patch.of_setup(base, diagnosed, saved, account, args.laws)
     )
     atomic_write(args.out, content)
-    config.load(schema, Path(args.out))  # as training, or the next diagnosis, will read it
+    config.load(schema, Path(args.out))  # checks that training, or the next diagnosis, can read it
     of_laws = [
         f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})"
         for law in laws
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _apply_firmware(args: argparse.Namespace) -> int:
-    """Write the configuration that flies the rate controller of a blackbox's firmware."""
+    """Write the configuration with the rate controller of a blackbox's firmware."""
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
@@ -100,9 +100,10 @@ def _apply_firmware(args: argparse.Namespace) -> int:
 def _plant_of_report(
     saved: "SavedDiagnosis", requested: str | None, option: str, folder: str
 ) -> str:
-    """Name of the plant or config that was diagnosed: sizes are counted from there.
+    """Return the name of the diagnosed plant or setup, to which the sizes are relative.
 
-    Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
+    ``option``: "plant" or "config". Raises DiagnoseError: the option names another one than the
+    diagnosis, or neither names one.
     """
     recorded = saved.report.get(option)
     if not (recorded or requested):
@@ -112,14 +113,14 @@ def _plant_of_report(
         )
     if recorded and requested and _path_from(folder, recorded) != _path_from(folder, requested):
         raise DiagnoseError(
-            f"{saved.path}: made with --{option} {recorded}; its sizes do not count from "
-            f"{requested}"
+            f"{saved.path}: made with --{option} {recorded}; its sizes do not count from"
+            f" {requested}; expected no --{option}, or the same"
         )
     return recorded or requested
 
 
 def _path_from(folder: str, name: str) -> str:
-    """Path under which another configuration finds one."""
+    """Return the path by which another configuration refers to this one."""
     path = config.find(folder, name)
     shipped = path.is_relative_to(config.configs_root())
     return path.relative_to(config.configs_root()).as_posix() if shipped else str(path.resolve())

@@ -1,5 +1,5 @@
-"""A diagnosis put into the configuration: a TOML on top of the diagnosed one, that training and the
-next diagnosis read.
+"""Writing a diagnosis as configuration: a TOML file based on the diagnosed configuration, for
+training and the next diagnosis.
 """
 
 from collections import defaultdict
@@ -30,7 +30,7 @@ from visthrow.task import Experiment, load_experiment, plant_of
 
 
 def extended(experiment: Experiment, theta: Sizes) -> Experiment:
-    """The experiment whose plant and sensors have these effects.
+    """Return the experiment with these effects in its plant and sensors.
 
     Raises ConfigError: an effect that the catalogue does not hold.
     """
@@ -49,7 +49,7 @@ def extended(experiment: Experiment, theta: Sizes) -> Experiment:
 
 
 def differences(before: Any, after: Any) -> dict[str, Any]:
-    """Nested entries of ``after`` that differ from ``before``."""
+    """Return the nested entries of ``after`` that differ from ``before``."""
     out = {}
     for key, value in after.items():
         old = before.get(key)
@@ -70,18 +70,20 @@ def text(
     provenance: Sequence[str],
     laws: Sequence[LawParams] = (),
 ) -> str:
-    """The TOML file.
+    """Return the text of the extended configuration.
 
     Args:
-        base: path of the diagnosed configuration, as ``base =`` is to name it.
+        base: path of the diagnosed configuration, as written behind ``base =``.
         experiment: that configuration, with the overrides of the diagnosis.
-        plants: to draw in training from the joint posterior.
-        laws: terms outside the catalogue, to stand beside those that the configuration has.
+        theta: sizes of the effects that were found.
+        covariance: of these sizes.
+        plants: number of plants that training draws from the joint posterior.
+        laws: terms outside the catalogue, added to those of the configuration.
     """
     effects = [catalogue()[name] for name in theta]
     covariance = np.reshape(covariance, (len(theta), len(theta)))
-    # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
-    # blocks there are
+    # the joint posterior holds only effects on the plant's numbers: none on sensors, on the
+    # replay's step or on the choice of blocks
     of_plant = []
     for i, effect in enumerate(effects):
         paths = [key.path for key in effect.changes]
@@ -113,8 +115,9 @@ def _file(
     words: Mapping[str, Sequence[str]],
     others: Sequence[str] = (),
 ) -> str:
-    """Return a file on top of another: comments, and what changes with words by the path of an
-    entry, ``others`` on what has none.
+    """Return the text of a TOML file based on another: comments, then the changed entries.
+
+    ``words``: path of an entry -> its comments; ``others``: comments on entries without such.
     """
     lines = [*(f"# {line}" for line in comments), dumps({"base": base}).strip(), ""]
     section = ""
@@ -131,9 +134,9 @@ def _file(
 def without_transient(
     theta: Sizes, covariance: np.ndarray
 ) -> tuple[dict[str, float], np.ndarray, list[str]]:
-    """Leave out effects that belong to the diagnosed flights and not to the vehicle.
+    """Leave out transient effects, which belong to the diagnosed flights and not to the vehicle.
 
-    Returns the other sizes, their covariance, and the names that were left out.
+    Returns the other sizes, their covariance, and the names of the effects left out.
     """
     sizes = {name: size for name, size in theta.items() if not catalogue()[name].transient}
     rows = [i for i, name in enumerate(theta) if name in sizes]
@@ -143,15 +146,16 @@ def without_transient(
 def with_firmware(
     path: str | Path, base: str, experiment: Experiment, hover: float, delay: float | None
 ) -> str:
-    """A configuration that flies the firmware's controller.
+    """Return the text of a configuration with the firmware's rate controller.
 
     Args:
-        path: of the blackbox, whose header tells the settings.
-        base: name of the configuration below. experiment: what it says.
-        hover: share of throttle in hover, 0 to 1, with the payload.
-        delay: from a command to the mixer [s]; None: as the configuration has it.
+        path: of the blackbox, whose header holds the settings.
+        base: name of the configuration on which the file is based.
+        experiment: that configuration.
+        hover: throttle in hover with the payload, 0 to 1.
+        delay: from a command to the mixer [s]; None: that of the configuration.
 
-    Raises DiagnoseError: settings are missing; LogError: no blackbox.
+    Raises DiagnoseError: settings are missing; LogError: the file is no blackbox.
     """
     settings = read_blackbox(path)[0].header
     plant = plant_of(experiment)
@@ -178,17 +182,18 @@ def of_setup(
     provenance: Sequence[str],
     rank: int,
 ) -> str:
-    """The TOML file of a setup of another model than the throw, extended by the sizes and laws that
-    a diagnosis of it found.
-
-    Raises DiagnoseError: no diagnosis, one of another model, or one without such an explanation.
+    """Return the text of a setup of any model but the throw, extended by the sizes and laws that a
+    diagnosis of it found.
 
     Args:
-        base: path of the diagnosed setup, as ``base =`` is to name it.
+        base: path of the diagnosed setup, as written behind ``base =``.
         setup: that setup.
         saved: the diagnosis.
-        provenance: lines on where it comes from.
+        provenance: comments on the origin of the diagnosis.
         rank: of the explanation whose laws are written, from 1; 0 for none.
+
+    Raises DiagnoseError: the file holds no diagnosis, one of another model, or no explanation of
+    this rank.
     """
     theta, covariance = saved.sizes
     if saved.model != setup.model:

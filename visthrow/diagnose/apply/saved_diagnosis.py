@@ -1,4 +1,4 @@
-"""The JSON that ``explain`` wrote: what was found, where it comes from, what speaks against it."""
+"""A diagnosis read from the JSON of ``explain``: sizes, laws, origin, and checks before use."""
 
 import json
 from collections.abc import Mapping
@@ -16,21 +16,21 @@ from visthrow.diagnose.inputs.model_arguments import THROW
 from visthrow.diagnose.models.catalogue import beyond_bounds
 from visthrow.diagnose.models.model_interface import Sizes
 
-HARM = 0.02  # share by which a channel may get worse on held-out flights
+HARM = 0.02  # largest relative increase of a channel's error on held-out flights
 
 
 @dataclass(frozen=True)
 class SavedDiagnosis:
-    """A diagnosis as ``explain`` wrote it."""
+    """The contents of a file that ``explain`` wrote."""
 
     report: Mapping[str, Any]
-    path: str  # of its file, for messages
+    path: str  # of the file, for messages
 
     @staticmethod
     def read(path: str) -> "SavedDiagnosis":
         """Read a file.
 
-        Raises DiagnoseError: it holds no JSON."""
+        Raises DiagnoseError: the file is not readable or holds no JSON."""
         try:
             return SavedDiagnosis(json.loads(Path(path).read_text(encoding="utf-8")), path)
         except (OSError, ValueError) as error:
@@ -43,10 +43,12 @@ class SavedDiagnosis:
 
     @cached_property
     def sizes(self) -> tuple[dict[str, float], np.ndarray]:
-        """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to
-        flight has the mean of those that were flown, and their scatter, to which that of days adds.
+        """Sizes and covariance expected of a future flight.
 
-        Raises DiagnoseError: something is missing."""
+        An effect that differs between flights has the mean of the diagnosed flights. Its variance
+        between flights, and that between days, are added to the covariance.
+
+        Raises DiagnoseError: an entry is missing or malformed."""
         try:
             theta = {str(name): float(size) for name, size in self.report["theta"].items()}
             covariance = np.array(self.report["covariance"], dtype=float)
@@ -72,9 +74,9 @@ class SavedDiagnosis:
         return theta, whole
 
     def laws(self, rank: int) -> list[LawParams]:
-        """All laws of the explanation of this rank, from 1; none for 0.
+        """Return all laws of the explanation of this rank, from 1; none for 0.
 
-        Raises DiagnoseError: there are fewer, or one that no grammar has.
+        Raises DiagnoseError: there are fewer explanations, or a law does not fit the grammar.
         """
         laws = []
         for x in self.explanation(rank):
@@ -86,26 +88,30 @@ class SavedDiagnosis:
         return laws
 
     def explanation(self, rank: int) -> list[dict[str, Any]]:
-        """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
+        """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them; none
+        for 0.
+
+        Raises DiagnoseError: there are fewer explanations.
+        """
         explanations = self.report.get("explanations") or []
         if rank > len(explanations):
             choices = f"expected a number up to {len(explanations)}"
             if not explanations:
                 reasons = "; ".join(self.report.get("reasons") or ["none"])
                 choices = (
-                    "it holds none: a formula is a law only where flights that are left out repeat"
-                    f" its coefficient. Reasons of its verdict: {reasons}"
+                    "it holds none: a formula is a law only if held-out flights confirm its"
+                    f" coefficient. Reasons of its verdict: {reasons}"
                 )
             asked = f"--laws asks for number {rank} of its laws"
             raise DiagnoseError(f"{self.path}: {asked}; {choices}")
         return explanations[rank - 1] if rank else []
 
     def refuse_strange(self, theta: Sizes, effects: Mapping[str, Effect]) -> None:
-        """Refuse effects that are none of the model's, though they may bear the same name, and
-        sizes that it cannot have.
+        """Refuse effects that the model does not have, in name or unit, and sizes outside bounds.
 
-        ``theta``: sizes that the model would have; ``effects``: its effects. Raises DiagnoseError:
-        an effect or its unit is none of the model's; a size lies outside its bounds."""
+        ``theta``: sizes that the model would have; ``effects``: the model's effects by name.
+        Raises DiagnoseError: the model has no such effect, has it in another unit, or a size lies
+        outside its bounds."""
         strange = [name for name in theta if name not in effects]
         if strange:
             raise DiagnoseError(
@@ -125,10 +131,10 @@ class SavedDiagnosis:
                 raise DiagnoseError(f"{self.path}: {beyond} in the {self.model}")
 
     def refuse_denied(self) -> None:
-        """Refuse what held-out flights deny.
+        """Refuse effects that held-out flights do not confirm.
 
-        Raises DiagnoseError: channels get worse with it, or no better; of a law alone, held-out
-        flights have not been asked."""
+        A diagnosis with laws alone passes: laws are not tested on held-out flights here.
+        Raises DiagnoseError: a channel's error increases, or the log-likelihood does not."""
         gain = self.report.get("gain") or {}
         reasons = []
         for c in gain.get("channels", ()):
@@ -144,7 +150,7 @@ class SavedDiagnosis:
             )
 
     def origin(self) -> list[str]:
-        """Lines on where it comes from, and what ``explain`` printed."""
+        """Return lines on the diagnosis' origin, and the lines that ``explain`` printed."""
         lines = [f"Extended by `visthrow diagnose apply` from {self.path}."]
         provenance = self.report.get("provenance") or {}
         for name in ("commit", "time", "command"):
@@ -153,5 +159,5 @@ class SavedDiagnosis:
         return [
             *lines,
             *self.report.get("summary", ()),
-            "The deviations below also allow for differences between flights.",
+            "The standard deviations below include differences between flights.",
         ]

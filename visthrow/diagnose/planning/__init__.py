@@ -1,3 +1,3 @@
-"""Planning of flights: which manoeuvre, or which excitation that is optimised for it, separates
-what could not be separated.
+"""Planning of flights: manoeuvres and optimised excitation that separate effects which the flights
+so far do not.
 """

@@ -1,17 +1,17 @@
-"""Excitation that is optimised: sweeps laid over a manoeuvre, within limits, for the most expected
+"""Optimised excitation: frequency sweeps added to a manoeuvre, within limits, for the most expected
 nats a second.
 
-What is varied: how much of the manoeuvre is kept; a sweep of the path along each axis and one of
-the heading, from one frequency to another; sweeps that are added to rates and thrust, at
-frequencies that no path follows. A sweep moves as far at each of its frequencies as its share of
-the limits lets, and all are made smaller until the path keeps within them, so that every design
-does.
+The variables are the amplitude of the manoeuvre itself; a sweep of the path along each axis and one
+of the heading, each between two frequencies; and sweeps added to rates and thrust, at frequencies
+above those that a path can follow. The amplitude of a sweep at each frequency is a share of the
+limits. The sweeps of the path are then scaled down together until the path is within the limits, so
+that every design is feasible.
 
-The objective is that of :class:`visthrow.diagnose.planning.plan.PlanningGoal` for the Fisher
-information of the simulated flight, by the linearised model that the selection uses, over its
-seconds. The search is differential evolution from a Sobol sequence about the manoeuvre: where the
-rope goes slack, how near a flight comes to being aborted has no derivative. A generation's flights
-are one batch.
+The objective is the gain of :class:`visthrow.diagnose.planning.plan.PlanningGoal` from the Fisher
+information of the simulated flight, divided by its duration; the information comes from the
+linearised model that the selection uses. The search is differential evolution from a Sobol sequence
+around the manoeuvre, which needs no derivative: the margin to an abort has none where the rope goes
+slack. The flights of a generation are one batch.
 
 Source: Bayesian optimal designs: Chaloner and Verdinelli 1995; inputs for flight vehicles: Morelli
 2021, multisines."""
@@ -31,47 +31,44 @@ from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, mov
 from visthrow.diagnose.planning.plan import PlanningGoal
 
 PATH = 0.08, 2.0
-"""Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop
-still follows.
+"""Lowest and highest frequency of a path's sweep [Hz]: once through the hall and back, and the
+limit of what a position loop follows.
 """
 
 ADDED = 0.5, 12.0
-"""Frequencies of what is added to the commands [Hz]: above the position loop, up to a quarter of
-the rate of the reference's rows.
+"""Lowest and highest frequency of the sweeps added to commands [Hz]: above the position loop, and a
+quarter of the rate of the reference's rows.
 """
 
-OPTIMISED = ", optimised"  # end of a design's name, behind its manoeuvre's
-FADE = 1.0  # in which sweeps begin and end [s]
-YAW_RATE = 1.5  # of the heading's sweep [rad/s]: within what the hover controller asks for
-ABORTED = 1e3  # cost of a flight that is aborted at the limit: above what any other costs [nats/s]
+OPTIMISED = ", optimised"  # suffix of a design's name, behind the manoeuvre's
+FADE = 1.0  # time in which sweeps fade in and out [s]
+YAW_RATE = 1.5  # largest rate of the heading's sweep [rad/s], within the hover controller's limit
+ABORTED = 1e3  # cost of a flight aborted at the limit, above that of any completed one [nats/s]
 
 SCATTER_SHARE = 0.5
-"""Way from the manoeuvre to the corners of the box of numbers that the first look goes at most:
-with all sweeps at once, few fly.
+"""Largest share of the way from the manoeuvre to the corners of the search box in the first
+generation: few designs with all sweeps at full amplitude can be flown.
 """
 
-ROUNDING = 1e-9  # by which a path that is known to be safe may leave its own limits [m, m/s, m/s^2]
-SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wants it
+ROUNDING = 1e-9  # tolerance for rounding at the limits of a path [m, m/s, m/s^2]
+SCATTERED = 16  # points of the first generation; a Sobol sequence needs a power of 2
 
 
 @dataclass(frozen=True)
 class Limits:
     """The limits of vehicle and hall.
 
-    Raises DiagnoseError: one that is not above 0, or a ceiling below the floor.
+    Raises DiagnoseError: a limit is not above 0, or ``highest`` is not above ``lowest``.
     """
 
-    half: tuple[float, float] = (
-        2.5,
-        2.5,
-    )  # of the hall, from its middle, that the path stays in [m]
-    lowest: float = 0.8  # [m]
-    highest: float = 2.6  # [m]
+    half: tuple[float, float] = (2.5, 2.5)  # half of the hall's length and width [m]
+    lowest: float = 0.8  # height [m]
+    highest: float = 2.6  # height [m]
     speed: float = 3.0  # [m/s]
     acceleration: float = 4.0  # [m/s^2]
-    # added to the body rates: that of the doublets, at which motors do not saturate [rad/s]
+    # amplitude added to the body rates: that of the doublets, which do not saturate motors [rad/s]
     rate: float = 3.0
-    thrust: float = 0.4  # added to the thrust, as a share of it
+    thrust: float = 0.4  # amplitude added to the thrust, relative to it
 
     def __post_init__(self) -> None:
         numbers = np.hstack([*vars(self).values()])
@@ -80,11 +77,13 @@ class Limits:
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
     def hold(self, path: ndarray) -> bool:
-        """Tell whether a path keeps within them; its rows are ``PERIOD`` apart, shape (N, 3)."""
+        """Return whether a path is within the limits; rows ``PERIOD`` apart, shape (N, 3)."""
         return np.all(_extremes(path) <= self._most + ROUNDING)
 
     def share(self, path: ndarray, added: ndarray) -> float:
-        """Largest share of a further way, 1 at most, with which a path keeps within them."""
+        """Return the largest share of ``added``, at most 1, that can be added to a path within the
+        limits; both of shape (N, 3).
+        """
         if self.hold(path + added):
             return 1.0
 
@@ -94,7 +93,7 @@ class Limits:
         return brentq(excess, 0.0, 1.0)
 
     def around(self, path: ndarray) -> "Limits":
-        """Limits that hold a path that is known to be safe too."""
+        """Return these limits, widened to include a path that is known to be safe."""
         x, y, depth, highest, *motion = np.maximum(self._most, _extremes(path)).tolist()
         return Limits((x, y), -depth, highest, *motion, self.rate, self.thrust)
 
@@ -105,8 +104,8 @@ class Limits:
 
 
 def _extremes(path: ndarray) -> ndarray:
-    """Return how far a path goes from the hall's middle along x and y, down and up [m], its speed
-    [m/s] and acceleration [m/s^2], shape (6,).
+    """Return the largest values of |x|, |y|, -z and z [m], speed [m/s] and acceleration [m/s^2] of
+    a path, shape (6,).
     """
     x, y, z = path.T
     vel = np.gradient(path, PERIOD, axis=0)
@@ -125,16 +124,15 @@ def sweep(
     limit: Callable[[ndarray], ndarray] = np.ones_like,
     phase: float = 0.0,
 ) -> ndarray:
-    """Return a sine that runs from one frequency to another over a time and fades in and out, shape
-    (N,).
+    """Return a sine whose frequency changes linearly and whose ends fade in and out, shape (N,).
 
     Args:
-        t: times after its start [s], shape (N,).
-        seconds: its length [s].
-        low: frequency at its start [Hz].
-        high: frequency at its end [Hz].
+        t: times since the start [s], shape (N,).
+        seconds: duration [s].
+        low: frequency at the start [Hz].
+        high: frequency at the end [Hz].
         limit: gives the amplitude at frequencies [Hz].
-        phase: at its start [rad].
+        phase: phase at the start [rad].
     """
     slope = (high - low) / seconds
     frequency = low + slope * t
@@ -146,7 +144,7 @@ def sweep(
 
 
 def _between(range_hz: tuple[float, float], share: float) -> float:
-    """Return the frequency at a share of the way through a range, by its logarithm [Hz]."""
+    """Return the frequency at a share of a logarithmic range [Hz]."""
     low, high = range_hz
     return low * (high / low) ** share
 
@@ -160,13 +158,15 @@ NUMBERS = (
     "thrust",
     "added_to",
 )
-"""What is varied, each from 0 to 1: shares of the limits, frequencies by their logarithm."""
+"""Variables of the search, each from 0 to 1: shares of the limits, and of logarithmic ranges of
+frequency.
+"""
 
-START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the manoeuvre as it is
+START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the unchanged manoeuvre
 
 
 def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
-    """Lay the sweeps of a vector of :data:`NUMBERS` over a manoeuvre."""
+    """Add the sweeps of a vector of :data:`NUMBERS` to a manoeuvre."""
     x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0)))
     kept = x["kept"]
     seconds = base.seconds - 2.0 * SETTLE
@@ -210,18 +210,18 @@ def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
 
 @dataclass(frozen=True)
 class Design:
-    """The best sweeps over a manoeuvre that a search found."""
+    """The best sweeps on a manoeuvre that a search found."""
 
     base: Manoeuvre
     manoeuvre: Manoeuvre
     numbers: ndarray  # values of :data:`NUMBERS`
     information: ndarray  # expected from the manoeuvre, see :meth:`PlanningGoal.information`
-    rate: float  # expected nats a second
-    start: float  # the same of ``base``
+    rate: float  # expected nats a second of the manoeuvre
+    start: float  # expected nats a second of ``base``
     flights: int  # number of simulated flights
 
     def record(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the design for JSON."""
         return {
             "base": self.base.name,
             "manoeuvre": self.manoeuvre.name,
@@ -235,8 +235,8 @@ class Design:
 def _judge(aim: PlanningGoal, simulated: Simulated, seconds: float) -> tuple[float, ndarray | None]:
     """Return the cost of a flight, and the information expected from it; None if it is aborted.
 
-    The cost falls with the expected nats a second. An aborted flight costs more than all others,
-    and the more the closer it comes to a crash."""
+    The cost is the negative of the expected nats a second. An aborted flight costs more than any
+    other, increasingly so the further it exceeds the limit."""
     if simulated.model is None:
         return ABORTED * simulated.used, None
     information = aim.information(simulated.model)
@@ -253,10 +253,10 @@ def optimise(
     steps: int = 6,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Design | None:
-    """Find the sweeps over a manoeuvre that promise the most nats a second; None where nothing that
-    was tried can be flown.
+    """Find the sweeps on a manoeuvre with the most expected nats a second; None if no tried design
+    can be flown.
 
-    ``steps``: generations of the search, of as many flights as the first look.
+    ``steps``: generations of the search after the first, each with as many flights.
     """
     count = len(NUMBERS)
     points = qmc.Sobol(count, seed=seed).random(SCATTERED)

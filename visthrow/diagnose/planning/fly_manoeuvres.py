@@ -1,5 +1,5 @@
-"""Manoeuvres flown in the simulator as the diagnosis left it, recorded as the user records: all of
-them in one batch.
+"""Simulation of manoeuvres in one batch, with the diagnosed plant, and logs of them like the
+user's.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -31,41 +31,41 @@ from visthrow.task import load_experiment, plant_of
 from visthrow.throws.plants import fly_payloads
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
-COARSE = 2.0  # steps of a promise, in those of the search
-# time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]
+COARSE = 2.0  # integration step of a planned flight's replay, relative to the search's
+# hover before a manoeuvre begins, in which a vehicle without payload drops it [s]
 APPROACH_SECONDS = 1.5
-# swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string
-# hangs slack
+# angle between rope and rotor axis [deg] beyond which the payload nears the rotors, or a string
+# becomes slack
 HIGHEST = 75.0
 
 ASTRAY = 0.5
-"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Manoeuvre.limits`
-says, its box is wider by that.
+"""Distance from the reference [m] beyond which a flight is aborted; the box of
+:meth:`Manoeuvre.limits` has the same margin.
 """
 
 TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
-"""A controller that follows a moving reference: the hover controller with room for it."""
+"""Parameters of the hover controller with wide limits, so that it follows a moving reference."""
 
-LOST = 10.0  # the same of a vehicle that flies off
-# mass of a setup's cable, in that of its payload: the setup's model has it without mass
+LOST = 10.0  # largest value of :attr:`SimulatedFlight.used`, for a vehicle that flies off
+# mass of a setup's cable relative to its payload; the setup's model has a cable without mass
 THREAD = 1e-3
 
 ROWS = ("pos_w", "yaw", "rates_b", "thrust_factor", "release")
-"""What is flown of a manoeuvre."""
-STEPS = round(PERIOD / SAMPLE_PERIOD)  # samples in a row of a reference
+"""Fields of a manoeuvre that are flown."""
+STEPS = round(PERIOD / SAMPLE_PERIOD)  # samples per row of a reference
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 FREE = ChannelSpec("", "none", (), "in the unit in which the model reads it")
-"""A channel of no standard name."""
+"""Specification of a channel without standard name."""
 
 
 @dataclass(frozen=True)
 class Simulated:
-    """A manoeuvre as it was flown in the simulator."""
+    """The model of a simulated manoeuvre."""
 
-    # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
-    # replayed
+    # model of this flight alone, with the diagnosis' catalogue; None if the flight is aborted or
+    # cannot be replayed
     model: Model | None
-    used: float  # of what ends a flight, see :attr:`SimulatedFlight.used`
+    used: float  # share of the limits, see :attr:`SimulatedFlight.used`
 
 
 Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
@@ -78,11 +78,11 @@ def simulator_of(
     *,
     seed: int = 0,
 ) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:
-    """Return two functions for a plan: one simulates manoeuvres, the other gives a manoeuvre as
-    this vehicle flies it, or None.
+    """Return two functions for a plan: one simulates manoeuvres, the other adapts a manoeuvre to
+    this vehicle, or returns None if the vehicle cannot fly it.
 
-    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``build``: gives a
-    setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
+    ``diagnosis``: gives the sizes of effects and the sensors' noise; ``build``: makes a setup's
+    model of logs. Raises DiagnoseError: the model has no vehicle that flies.
     """
     if isinstance(model, ThrowModel):
         plant = apply(model.entries, model.setting, diagnosis.theta).plant
@@ -112,7 +112,9 @@ def simulator_of(
 def _throw_model(
     model: ThrowModel, noise: Mapping[str, float], flight: "SimulatedFlight"
 ) -> ThrowModel:
-    """Return the throw's model of a simulated flight, with the effects of another flight's."""
+    """Return the throw's model of a simulated flight, with those effects of ``model`` that apply to
+    it.
+    """
     log = flight.log(noise, model.has_voltage)
     carries = flight.manoeuvre.payload
     releases = np.any(flight.manoeuvre.release)
@@ -133,7 +135,9 @@ def _throw_model(
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
-    """The manoeuvre with what a setup's vehicle carries; None where it would have to drop it."""
+    """Return the manoeuvre with the payload of a setup's vehicle, or without; None if the vehicle
+    would have to drop its payload.
+    """
     carries = params.cable is not None
     if np.any(manoeuvre.release) or (carries and not manoeuvre.payload):
         return None
@@ -141,8 +145,8 @@ def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
 
 
 def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
-    """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the
-    numbers that the setup states.
+    """Return the plant of a setup's vehicle: a known plant, scaled to the vehicle's mass at equal
+    Froude number, with the parameters that the setup states.
     """
     ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
@@ -170,7 +174,9 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
-    """Deviation of each channel, as stated by the model times the scale that was found."""
+    """Return the noise of each channel: the model's standard deviation times the estimated
+    scale.
+    """
     point = diagnosis.work.after
     noise = {}
     for c, name in enumerate(diagnosis.work.problem.model.channels):
@@ -196,8 +202,8 @@ class SimulatedFlight:
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
     def simulated(self, model_of: Callable[["SimulatedFlight"], Model]) -> Simulated:
-        """Return how near it came to being aborted, with the model that ``model_of`` makes of it if
-        it was not.
+        """Return the model that ``model_of`` makes of the flight, None if the flight is aborted or
+        cannot be replayed; and the share of the limits that it used.
         """
         used = self.used
         try:
@@ -207,16 +213,18 @@ class SimulatedFlight:
 
     @property
     def origin_w(self) -> ndarray:
-        """Position of the body frame's origin [m], shape (N, 3): motion capture reports it, while
-        the simulator moves the centre of mass.
+        """Return the position of the body frame's origin [m], shape (N, 3), which motion capture
+        reports; the simulator's position is that of the centre of mass.
         """
         com = np.array([self.plant.vehicle.body.com])
         return self.truth["pos_w"] - rotate(self.truth["quat_wb"], com)
 
     @property
     def used(self) -> float:
-        """The largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was
-        reached; the flight is aborted from 1.
+        """Return the largest share that the flight used of its limits; it is aborted from 1.
+
+        The limits are ``HIGHEST`` for the swing, ``ASTRAY`` for the distance from the reference,
+        and the height of :attr:`Manoeuvre.lowest`.
         """
         planned = self.manoeuvre.pos_w
         off = self.truth["pos_w"][::STEPS] - planned
@@ -230,8 +238,8 @@ class SimulatedFlight:
 
     @property
     def swing(self) -> float:
-        """Largest angle between the rope and the rotors' axis while the payload hangs [deg]; 0
-        without payload.
+        """Return the largest angle between the rope and the rotors' axis while the payload hangs
+        [deg]; 0 without payload.
         """
         if not self.manoeuvre.payload:
             return 0.0
@@ -242,8 +250,8 @@ class SimulatedFlight:
         return tilt_deg(rope_b).max()
 
     def log(self, noise: Mapping[str, float], voltage: bool = True) -> FlightLog:
-        """Return a flight log like the throw's: poses from motion capture, commands as sent, and
-        the battery's ``voltage`` if the vehicle logs it.
+        """Return a flight log like a throw's: poses from motion capture, commands as sent, and the
+        battery's voltage if ``voltage``.
         """
         poses = {"pos_w": self.origin_w}
         poses |= {name: self.truth[name] for name in ("payload_pos_w", "quat_wb")}
@@ -256,8 +264,8 @@ class SimulatedFlight:
     def setup_log(
         self, params: FlyerParams, noise: Mapping[str, float], voltage: bool = False
     ) -> FlightLog:
-        """Return a flight log like those of a setup: its channel names, inputs through its map of
-        thrust, and what an IMU on board measures.
+        """Return a flight log like a setup's: with its channel names, inputs converted by its
+        thrust map, and measurements of an IMU on board.
         """
         truth = {**self.truth, "pos_w": self.origin_w}
         names = {"pos_w": params.position, "quat_wb": params.attitude}
@@ -282,7 +290,9 @@ class SimulatedFlight:
         return FlightLog(kept, {"period": PERIOD})
 
     def _input(self, params: FlyerParams) -> dict[str, Channel]:
-        """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
+        """Return the input of a setup's log: thrust converted by the inverse of map, lag and
+        delay.
+        """
         if params.input in ("command", "thrust_command", "throttle"):
             values = command_of(params.thrust_map, self.commands[:, :1])
             if params.input == "command":
@@ -291,7 +301,7 @@ class SimulatedFlight:
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
         lag = self.plant.vehicle.motor.time_constant
         lagged = thrust + lag * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
-        # samples that are held stand for what lies about them
+        # a held sample stands for the period centred on it
         stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
         return _channels(stamps, {params.input: command_of(params.thrust_map, lagged)})
 
@@ -308,8 +318,8 @@ def _channels(time: ndarray, values: Mapping[str, ndarray]) -> dict[str, Channel
 def fly(
     plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu"
 ) -> list[SimulatedFlight]:
-    """Fly all manoeuvres at once; those without payload drop it first, and all hover where their
-    reference begins.
+    """Simulate manoeuvres in one batch; all hover first where their reference begins, where those
+    without payload drop it.
     """
     from sim.hybrid import HybridSim
 
@@ -320,7 +330,7 @@ def fly(
     thrusts = {"min_thrust": 4.0 * motors.min_thrust, "max_thrust": 4.0 * motors.max_thrust}
     gains = replace(TRACKING, **thrusts)
     controller = HoverController(gains, PERIOD, count)
-    # a controller that follows velocities and accelerations by a goal that is ahead
+    # the goal is ahead of the reference, so that the controller follows velocity and acceleration
     vel_w = np.gradient(pos_w, PERIOD, axis=0)
     push = vel_w + np.gradient(vel_w, PERIOD, axis=0) / gains.velocity_gain
     goals = pos_w + push / gains.position_gain
@@ -352,7 +362,7 @@ def fly(
             begun = SAMPLE_PERIOD - sim.get("separation_time")
             falling = np.where(sim.get("separated") != 0, begun, falling + SAMPLE_PERIOD)
     truth = {name: np.array(values) for name, values in zip(SAMPLED, zip(*samples))}
-    # the simulator keeps a payload's state at its separation; all fall at once, not step by step
+    # the simulator keeps a payload's state at its separation; the falls are computed in one batch
     vel_w, fallen = map(np.array, zip(*falls))
     loose = fallen > 0.0
     begin = truth["payload_pos_w"][loose], vel_w[loose]
@@ -368,7 +378,9 @@ def fly(
 
 
 def _stack(manoeuvres: Sequence[Manoeuvre], name: str) -> ndarray:
-    """Return rows of manoeuvres side by side, each at its last one from its end on."""
+    """Stack a field of manoeuvres, shape (rows, manoeuvres, ...); shorter ones repeat their last
+    row.
+    """
     columns = [getattr(m, name) for m in manoeuvres]
     rows = np.arange(max(map(len, columns)))
     held = [column[np.minimum(rows, len(column) - 1)] for column in columns]

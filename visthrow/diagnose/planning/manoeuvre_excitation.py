@@ -1,9 +1,9 @@
-"""Sweeps of a rate's set-point that an autopilot flies by itself, as settings of Betaflight's CHIRP
-and ArduPilot's SYSTEMID.
+"""Settings with which autopilots sweep a rate's set-point: Betaflight's CHIRP and ArduPilot's
+SYSTEMID.
 
-A sweep of 20 s holds all frequencies between slow sway and the noise of the gyro, which a doublet
-does not; the autopilot adds it behind the radio, at its own loop's rate. Its blackbox tells the
-set-point with the sweep in it, ArduPilot's log the sweep beside it."""
+Unlike a doublet, a sweep of 20 s excites all frequencies between slow sway and the noise of the
+gyro. The autopilot adds it to the radio's commands at the rate of its control loop. Betaflight's
+blackbox logs the set-point with the sweep included, ArduPilot logs the sweep separately."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from visthrow.common.toml_text import tables_beside
 
 
 def write(folder: str | Path) -> list[Path]:
-    """Write the settings of all; returns the files."""
+    """Write the settings of all autopilots and axes; returns the files."""
     table = tables_beside(__file__)
     files = {"betaflight_chirp.txt": table["betaflight"]}
     for name, numbers in table["axes"].items():

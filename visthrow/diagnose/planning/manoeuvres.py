@@ -1,9 +1,9 @@
-"""Safe flights that separate causes: references of position, heading and what is added to the
-commands, 50 times a second.
+"""Safe manoeuvres that separate effects: references of position, heading and additions to the
+commands, at 50 Hz.
 
 A pilot or controller follows the position; doublets and thrust steps are added to its commands.
-Each stays within a box of a few metres and leaves the payload well below the rotors;
-:meth:`Manoeuvre.limits` says when to abort."""
+Each manoeuvre stays within a box of a few metres, and its payload stays well below the rotors.
+:meth:`Manoeuvre.limits` states when to abort."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from numpy.polynomial import Polynomial
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.common.toml_text import tables_beside
 
-PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
-SETTLE = 1.0  # hover before and after [s]
+PERIOD = 0.02  # time between rows of a reference [s]: the paper's command rate
+SETTLE = 1.0  # hover before and after the motion [s]
 # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
 HEIGHT = 1.5
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One flight: N rows of a reference, ``PERIOD`` apart, from the start of the hover before it to
-    the end of that after it.
+    """A manoeuvre: a reference of N rows, ``PERIOD`` apart, including the hover before and after
+    the motion.
     """
 
     name: str
     purpose: str
-    seconds: float  # with SETTLE at both ends
+    seconds: float  # duration, including SETTLE at both ends
     pos_w: ndarray  # [m], shape (N, 3)
     yaw: ndarray  # [rad], shape (N,)
     rates_b: ndarray  # added to the commanded body rates [rad/s], shape (N, 3)
@@ -42,12 +42,12 @@ class Manoeuvre:
 
     @property
     def time(self) -> ndarray:
-        """Times of the rows [s], shape (N,)."""
+        """Return the times of the rows [s], shape (N,)."""
         return times_of(self.seconds)
 
     @cached_property
     def vel_w(self) -> ndarray:
-        """[m/s], shape (N, 3)."""
+        """Return the velocity of the reference [m/s], shape (N, 3)."""
         return np.gradient(self.pos_w, PERIOD, axis=0)
 
     @property
@@ -58,11 +58,11 @@ class Manoeuvre:
 
     @property
     def file(self) -> str:
-        """Name of the file that holds its reference."""
+        """Return the name of the file for the reference."""
         return "".join(c if c.isalnum() else "_" for c in self.name) + ".csv"
 
     def limits(self) -> str:
-        """Return when to abort, in words."""
+        """Return in words the limits beyond which to abort."""
         low = self.pos_w.min(0) - 0.5
         high = self.pos_w.max(0) + 0.5
         speed = np.linalg.norm(self.vel_w, axis=1).max()
@@ -72,7 +72,7 @@ class Manoeuvre:
         )
 
     def csv(self) -> str:
-        """The reference as a table with units in its header."""
+        """Return the reference as a CSV table with units in its header."""
         header = (
             "time [s],x_w [m],y_w [m],z_w [m],vx_w [m/s],vy_w [m/s],vz_w [m/s],yaw [rad],added"
             " rate_x_b [rad/s],added rate_y_b [rad/s],added rate_z_b [rad/s],thrust factor,release"
@@ -90,28 +90,30 @@ def times_of(seconds: float) -> ndarray:
 
 
 def moving_times(seconds: float) -> ndarray:
-    """Return the times after SETTLE of a manoeuvre's rows [s], those in the hover before and after
-    at the ends of its motion.
+    """Return the times of a manoeuvre's rows since the start of its motion [s], clipped to the
+    motion during the hover before and after.
     """
     return np.clip(times_of(seconds) - SETTLE, 0.0, seconds - 2.0 * SETTLE)
 
 
 def _share(t: ndarray, begin: float, length: float) -> ndarray:
-    """Return the share of a stretch that is over, 0 to 1."""
+    """Return the elapsed share of an interval, 0 to 1."""
     return np.clip((t - begin) / length, 0.0, 1.0)
 
 
 RISE = Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0])
-"""From 0 at 0 to 1 at 1, with speed and acceleration 0 at both ends."""
+"""Polynomial from 0 at 0 to 1 at 1, whose first two derivatives are 0 at both ends."""
 
 
 def rise(t: ndarray, begin: float, length: float) -> ndarray:
-    """Return a rise from 0 to 1 over a stretch."""
+    """Return a smooth rise from 0 to 1 over an interval of time."""
     return RISE(_share(t, begin, length))
 
 
 def _doublets(t: ndarray) -> ndarray:
-    """Rates of 3 rad/s about roll, pitch and yaw in turn, every 0.8 s, 0.08 s there and back."""
+    """Return rate doublets of 3 rad/s about roll, pitch and yaw in turn, one every 0.8 s, 0.08 s in
+    each direction; shape (N, 3).
+    """
     out = np.zeros((len(t), 3))
     number, phase = np.divmod(t, 0.8)
     rows = np.arange(len(t))
@@ -120,28 +122,28 @@ def _doublets(t: ndarray) -> ndarray:
 
 
 def _pulse(phase: ndarray, width: float) -> ndarray:
-    """Return 1 for a time and -1 for as long after it, then 0."""
+    """Return 1 during ``width``, -1 for as long after it, then 0."""
     forth = phase < width
     back = (phase >= width) & (phase < 2.0 * width)
     return 1.0 * forth - back
 
 
 def _steps(t: ndarray) -> ndarray:
-    """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the
-    height back.
+    """Return a factor on the thrust of 1.4, then 0.6, for 0.15 s each, every 1.5 s; the controller
+    restores the height.
     """
     return 1.0 + 0.4 * _pulse(np.mod(t, 1.5), 0.15)
 
 
 def _integrate_rise(t: ndarray, begin: float, length: float) -> ndarray:
-    """Integral of :func:`rise` over time."""
+    """Return the integral of :func:`rise` over time [s]."""
     after = np.maximum(t - begin - length, 0.0)
     return length * RISE.integ()(_share(t, begin, length)) + after
 
 
 def _stop(t: ndarray) -> ndarray:
-    """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope
-    stays taut.
+    """Return a path that accelerates to 1.5 m/s over 1.6 s, stops within 0.3 s and returns slowly
+    [m]; from this speed the rope stays taut.
     """
     distance = 1.5 * 0.5 * (1.6 + 0.3)
     velocity = 1.5 * (_integrate_rise(t, 0.0, 1.6) - _integrate_rise(t, 1.6, 0.3))
@@ -149,13 +151,13 @@ def _stop(t: ndarray) -> ndarray:
 
 
 def _sine(t: ndarray) -> ndarray:
-    """Height that swings by 0.25 m at 0.8 Hz, begun and ended within a second."""
+    """Return a height [m] that oscillates by 0.25 m at 0.8 Hz, faded in and out over a second."""
     grown = rise(t, 0.0, 1.0) * (1.0 - rise(t, 5.0, 1.0))
     return HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * grown
 
 
 def _round(t: ndarray) -> ndarray:
-    """Angle of two turns in eight seconds."""
+    """Return the angle of two turns in eight seconds [rad]."""
     return 4.0 * np.pi * rise(t, 0.0, 8.0)
 
 
@@ -167,12 +169,14 @@ SHAPES: dict[str, Callable[[ndarray], ndarray]] = {
     "doublets": _doublets,
     "steps": _steps,
 }
-"""What the table of manoeuvres names."""
+"""Shapes that the table of manoeuvres refers to by name."""
 
 
 def _along(shape: Any, t: ndarray) -> ndarray:
-    """Return values at times [s] of a named shape, or of a value and its rises, each with its size,
-    its begin and its length [s].
+    """Return the values of a shape at times [s].
+
+    ``shape``: a name of :data:`SHAPES`; a constant; or a start value and rises, each with its size,
+    start [s] and duration [s].
     """
     if isinstance(shape, str):
         return SHAPES[shape](t)
@@ -197,7 +201,7 @@ def _manoeuvre(
     release: float = np.inf,
     payload: bool = True,
 ) -> Manoeuvre:
-    """Return a manoeuvre of a row of the table, whose shapes :func:`_along` reads."""
+    """Make a manoeuvre from a row of the table, whose shapes :func:`_along` reads."""
     time = times_of(seconds)
     t = moving_times(seconds)
     pos_w = np.column_stack([_along(axis, t) for axis in (x, y, z)])
@@ -212,14 +216,14 @@ def _manoeuvre(
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:
-    """All manoeuvres, in the order in which they would be flown on a day."""
+    """Return all manoeuvres, in the order in which to fly them on one day."""
     return tuple(_manoeuvre(name, **row) for name, row in tables_beside(__file__).items())
 
 
 def named(names: Iterable[str]) -> list[Manoeuvre]:
-    """Return the manoeuvres of these names, in their order.
+    """Return the manoeuvres of these names, in the order of the names.
 
-    Raises DiagnoseError for one that the catalogue does not hold.
+    Raises DiagnoseError: the catalogue has no manoeuvre of a name.
     """
     names = list(names)
     by_name = {m.name: m for m in catalogue()}

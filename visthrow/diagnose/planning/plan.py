@@ -1,9 +1,9 @@
-"""Which flight to fly next: the manoeuvre that separates what these flights could not, with the
-evidence it promises.
+"""Ranking of manoeuvres and ground measurements by the evidence expected from them.
 
-Each manoeuvre is simulated with the model as found; its expected information, or that of a
-measurement on the ground, is added to that at hand. For two members of a class the promise is the
-expected gap of their evidence with either as the truth, the smaller of both."""
+Each manoeuvre is simulated with the diagnosed model. Its expected information, or that of a
+measurement on the ground, is added to the information of the flights so far. For two members of a
+class, the expected gain is the expected difference of their evidence, with either as the truth; the
+smaller one counts."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -25,11 +25,12 @@ from visthrow.diagnose.select.held_out import count_telling
 from visthrow.diagnose.select.result import Diagnosis
 
 DECISIVE = 11.0
-"""Expected nats that tell two members of a class apart: those that come scatter with twice their
-mean as variance, and exceed the 3 nats of a class in 95 % of flights.
-"""
+"""Expected nats that separate two members of a class.
 
-# deviation of an effect, in that of its prior, from which on its usual size is named
+The actual nats have twice their mean as variance, so that they exceed the 3 nats of a class in 95 %
+of flights."""
+
+# ratio of an effect's standard deviation to its prior's, below which a typical size is selected
 NAMEABLE = 0.2
 
 MOST_REPEATS = 10
@@ -37,31 +38,31 @@ MOST_REPEATS = 10
 
 @dataclass(frozen=True)
 class FlightProposal:
-    """One manoeuvre, or one measurement on the ground, and what it promises."""
+    """A manoeuvre or a measurement on the ground, with the evidence expected from it."""
 
     name: str
     purpose: str
     seconds: float
-    # of the pair that is hardest to separate, or the logarithm by which a deviation shrinks
+    # expected nats between the pair hardest to separate, or the mean log ratio by which standard
+    # deviations shrink
     nats: float
     separates: tuple[tuple[str, ...], ...]  # pairs beyond DECISIVE after ``repeats`` flights
-    # flights until the hardest pair is beyond DECISIVE; 0 where MOST_REPEATS do not suffice
+    # fewest flights that separate the most, see :meth:`PlanningGoal.settled`; 0 if even
+    # MOST_REPEATS separate nothing
     repeats: int
     limits: str
     reference: str = ""  # file of its reference
 
 
 class PlanningGoal:
-    """The question that the flights to come are to settle, and the worth of one flight's
-    information for it.
-    """
+    """The effects to separate or to estimate, and the gain from a flight's information for them."""
 
     def __init__(self, diagnosis: Diagnosis, names: Sequence[str] = ()):
-        """Take the classes to be separated, or else what could not be identified, or else every
-        effect that can be seen.
+        """Plan for classes; without classes, for the named effects, else for effects that are not
+        identifiable, else for all visible effects but switches.
 
-        ``names``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect
-        that the diagnosis does not know."""
+        ``names``: effects to plan for; empty for all. Raises DiagnoseError: the diagnosis does not
+        know an effect."""
         work = diagnosis.work
         effects = work.problem.model.effects
         self.diagnosis = diagnosis
@@ -83,8 +84,8 @@ class PlanningGoal:
         self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
     def information(self, model: Model) -> ndarray:
-        """Return the expected information of one simulated flight about the diagnosis' effects, in
-        its floors, shape (K, K); 0 for what it hides.
+        """Return the expected information of one simulated flight on the diagnosis' effects, in
+        floors, shape (K, K); 0 for effects that the flight's model does not have.
         """
         theta = self.diagnosis.theta
         noise = self.base.noise
@@ -102,22 +103,22 @@ class PlanningGoal:
         )
         flown_theta = np.zeros(len(floors))
         information = Integrals(grams, expected).statistics(grams, flown_theta).information.sum(0)
-        # both catalogues name the same effects, each in floors of its own
+        # effects are matched by name; each catalogue has floors of its own
         same = np.array(self.names)[:, None] == flown
         places = same * self.priors.floor[:, None] / floors
         return places @ information @ places.T
 
     def nats(self, new: ndarray) -> float:
-        """Expected nats between the members of the pair that is hardest, or the mean logarithm by
-        which deviations shrink.
+        """Return the expected nats between the pair hardest to separate, or the mean log ratio by
+        which the effects' standard deviations shrink.
         """
         if self.pairs:
             return min(self._gap(pair, new) for pair in self.pairs)
         return np.log(self._deviations(0.0 * new) / self._deviations(new)).mean()
 
     def settled(self, new: ndarray) -> tuple[list[tuple[int, ...]], int]:
-        """Pairs apart, or effects that can be named, after the fewest flights that settle the most;
-        and the number of these.
+        """Return the pairs separated, or the effects measured well enough, by the fewest flights
+        that settle most of them; and the number of these flights.
         """
         most = []
         repeats = 0
@@ -129,15 +130,15 @@ class PlanningGoal:
         return most, repeats
 
     def _settled_by(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
-        """Return the pairs that so many flights separate, or the effects that they measure well
-        enough to name.
+        """Return the pairs that ``count`` flights separate, or the effects that they measure well
+        enough to select.
         """
         if self.pairs:
             return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
         able = self.priors.slab[self.vague] * NAMEABLE
         unknown = self._deviations(0.0 * new) > able
         known = self._deviations(count * new) < able
-        # a name counts as confirmed once so many flights bear on it
+        # an effect needs at least FEWEST informative flights to be confirmed
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
         flown = np.tile(new[self.vague, self.vague], (count, 1))
         promised = 0.5 * np.vstack((at_hand, flown)) * self.priors.slab[self.vague] ** 2
@@ -145,10 +146,10 @@ class PlanningGoal:
         return [(j,) for j in np.compress(unknown & known & confirmed, self.vague)]
 
     def _gap(self, pair: tuple[int, int], new: ndarray) -> float:
-        """Expected nats between two members after the new flight, with either as the truth; the
-        smaller one.
+        """Return the expected nats between two members after the new flight: the smaller one of
+        those with either member as the truth.
 
-        A member that is already behind by more than a class allows is no truth to plan for.
+        A member that is already more than ``STRONG`` nats behind is not considered as the truth.
         """
         base = self.base.posterior
         priors = self.priors
@@ -168,8 +169,8 @@ class PlanningGoal:
         return min(gaps)
 
     def _deviations(self, new: ndarray) -> ndarray:
-        """Posterior deviation of each effect that is planned for, if it were named, with more
-        information.
+        """Return the posterior standard deviation of each effect to plan for, if it were selected,
+        with additional information, in floors.
         """
         base = self.base.posterior
         after = replace(base, information=base.information + new)
@@ -180,9 +181,7 @@ class PlanningGoal:
         return np.array(deviations)
 
     def measurements(self) -> list[tuple[Measurement, ndarray]]:
-        """Return the measurements on the ground of members of classes, with the information of
-        each.
-        """
+        """Return the ground measurements of effects in classes, with the information of each."""
         promised = []
         for m in MEASUREMENTS:
             if any(m.effect in (self.names[a], self.names[b]) for a, b in self.pairs):
@@ -193,7 +192,7 @@ class PlanningGoal:
         return promised
 
     def proposal(self, flight: Manoeuvre | Measurement, new: ndarray) -> FlightProposal:
-        """Return the promise of a manoeuvre, or of a measurement, of this information."""
+        """Return the proposal of a manoeuvre or a measurement with this information."""
         separated, repeats = self.settled(new)
         separates = [tuple(self.names[j] for j in group) for group in separated]
         return FlightProposal(
@@ -211,16 +210,16 @@ class PlanningGoal:
 def propose(
     aim: PlanningGoal, informed: Sequence[tuple[Manoeuvre, ndarray]]
 ) -> list[FlightProposal]:
-    """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
-    the expected information of each.
-    """
+    """Rank manoeuvres and measurements, best first.
+
+    ``informed``: manoeuvres to choose from, with the expected information of each."""
     promised = [*informed, *aim.measurements()]
     return sorted((aim.proposal(*each) for each in promised), key=_worth, reverse=True)
 
 
 def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
-    """Return the flights of one session: of ranked proposals, each that separates what none before
-    it does.
+    """Return the flights of one session: each ranked proposal that separates a pair or effect which
+    none before it does.
     """
     chosen = []
     separated = set()
@@ -232,21 +231,21 @@ def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
 
 
 def _worth(p: FlightProposal) -> tuple[float, float]:
-    """Return the sort key of a proposal: settling most comes first, soonest; one that settles
-    nothing counts by its nats a second.
+    """Return the sort key of a proposal: the number of pairs or effects that it settles, then its
+    nats, each over the square root of the time that it takes.
     """
     settles = len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1))
     return settles, p.nats / np.sqrt(p.seconds)
 
 
 def _expect_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:
-    """Return the latent forces of each block in each phase: where none were flown, those of the
-    block's roughest phase.
+    """Return the expected standard deviation of the latent forces by block and phase; for a phase
+    that was not flown, that of the block's strongest phase.
     """
     loudest = defaultdict(float)
     for (block, _), level in noise.latent_sd.items():
         loudest[block] = max(level, loudest[block])
-    # of a payload that has not been flown: as strongly as the vehicle [N]
+    # a payload that has not been flown gets the level of the vehicle [N]
     default = loudest.get(0, 1.0)
     levels = {}
     for block, phase in product(range(len(LATENT_BLOCKS)), phases):

@@ -1,5 +1,5 @@
-"""``visthrow diagnose simulate``: fly manoeuvres in the simulator, and record them as a user's
-motion capture does.
+"""``visthrow diagnose simulate``: fly manoeuvres in the simulator, and record them like motion
+capture.
 """
 
 import argparse
@@ -9,15 +9,17 @@ from visthrow.common.arguments import declare
 from visthrow.common.errors import DiagnoseError
 
 NOISE = {"pos_w": 5e-4, "quat_wb": 3.5e-3, "payload_pos_w": 8e-4}
-"""Of the recorded poses, standard deviations [m], [rad], [m]: motion capture of a hall."""
+"""Standard deviations of the recorded poses [m], [rad], [m], typical of motion capture in a
+hall.
+"""
 
 add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly each manoeuvre once, and write a log of each, or none if one of them is refused.
+    """Fly each manoeuvre once, and write a log of each, or no log if one manoeuvre is refused.
 
-    Raises DiagnoseError: a manoeuvre that does not exist, or that this vehicle cannot fly."""
+    Raises DiagnoseError: a manoeuvre does not exist, or this vehicle cannot fly it."""
     from visthrow.common.compute_device import resolve_for_warp
     from visthrow.common.storage import writable
     from visthrow.diagnose.planning import manoeuvres
