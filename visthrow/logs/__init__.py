@@ -1,4 +1,4 @@
-"""Logs of any kind, opened by their ending, into :class:`visthrow.logs.flightlog.FlightLog`."""
+"""Reading of log files of any format into :class:`visthrow.logs.flightlog.FlightLog`."""
 
 import re
 from collections.abc import Sequence
@@ -13,31 +13,31 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
 BLACKBOX = (".bbl", ".bfl", ".bf")
-"""Of Betaflight; the last is that of its software in the loop."""
+"""Extensions of Betaflight's logs; the last is that of its software in the loop."""
 AUTOPILOTS = (".ulg", ".bin", ".tlog")
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".tsv", ".txt", ".parquet")
 SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
-"""Endings of logs that describe their own contents and need no mapping."""
+"""Extensions of logs that describe their own contents and need no mapping."""
 RUN_LOG = "flight.npz"
-"""In the folder of a run of ``visthrow hil``: its flight log, written where no throw was flown and
+"""Flight log in the folder of a run of ``visthrow hil``; written if no throw was flown and
 ``--bare`` was not given.
 """
 RUN_TICKS = "ticks.jsonl"
-"""Beside it: the ticks that it is made of."""
+"""File of a run's ticks, from which the flight log is made."""
 BAG = "metadata.yaml"
-"""In the folder of a ROS 2 bag."""
+"""File that marks the folder of a ROS 2 bag."""
 
 
 def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
-    """Read a file, or the folder of a run, into flight logs; a file may hold several.
+    """Read a file or a folder into flight logs; a file may hold several.
 
-    Raises LogError: it cannot be read, or a table needs a mapping.
+    Raises LogError: the file cannot be read, or a table needs a mapping.
 
     Args:
-        path: A file of one of the endings above or ``.npz``, or a folder that holds a
-            ``flight.npz``. ``stand.csv:a1_*`` takes of the logs in a file those whose part fits the
-            pattern; ``LOG00001.BFL+mocap.csv`` joins logs of one flight.
-        mapping: Of a table's columns; not needed for our own exports and decoded blackbox logs.
+        path: A file, or a folder with a ``flight.npz``, other logs or tables. ``stand.csv:a1_*``
+            selects the logs in a file whose part matches the pattern; ``LOG00001.BFL+mocap.csv``
+            joins logs of one flight.
+        mapping: Of a table's columns; our own exports and decoded blackbox logs need none.
     """
     from visthrow.logs.readers.autopilot_logs import choose_converted_tables, log_of_autopilot
 
@@ -66,8 +66,8 @@ def read_all(paths: Sequence[str | Path], mapping: TableMap | None = None) -> li
 
 
 def takes_mapping(path: str | Path) -> bool:
-    """Whether a mapping of columns is used where :func:`read` reads this: a table, or logs with one
-    among them.
+    """Return whether :func:`read` uses a mapping of columns for a path: for a table, or for joined
+    logs with a table among them.
     """
     parts = [str(path)] if Path(path).exists() else str(path).split("+")
     files = [Path(part if Path(part).exists() else part.rpartition(":")[0]) for part in parts]
@@ -75,7 +75,7 @@ def takes_mapping(path: str | Path) -> bool:
 
 
 def _describes_itself(path: Path) -> bool:
-    """Tell whether a file, or a folder, needs no mapping."""
+    """Return whether a file or folder needs no mapping."""
     from visthrow.logs.readers.autopilot_logs import choose_converted_tables
 
     if (path / BAG).is_file():
@@ -86,8 +86,8 @@ def _describes_itself(path: Path) -> bool:
 
 
 def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
-    """Read what names no file, but logs of one flight joined by ``+``, or parts of a file behind a
-    colon.
+    """Read a path that is no file: logs of one flight joined by ``+``, or ``FILE:PATTERN``, the
+    parts of a file.
     """
     file, _, pattern = str(path).rpartition(":")
     first, *further = str(path).split("+")
@@ -114,7 +114,7 @@ def _read_named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
 
 
 def _refuse_pointer(path: Path) -> None:
-    """Raise LogError: in a file's place stands a pointer of Git LFS."""
+    """Raise LogError if a file is a pointer of Git LFS."""
     if path.is_file():
         with path.open("rb") as file:
             if file.read(23) == b"version https://git-lfs":
@@ -153,9 +153,9 @@ def _tables_in(folder: Path) -> list[Path]:
 
 
 def _table_of_folder(folder: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a folder's tables, as of a recording whose topics they are: what their
-    names begin with alike is left out.
-    """
+    """Return the columns of all tables in a folder, named ``TOPIC:COLUMN`` as in a recording.
+
+    A topic is the file's name without the prefix that all files share."""
     from visthrow.logs.readers.table_to_log import Columns
 
     files = _tables_in(folder)
@@ -179,7 +179,7 @@ def _table_of_folder(folder: Path) -> dict[str, np.ndarray]:
 def table_of(path: str | Path) -> dict[str, np.ndarray]:
     """Return the columns of a table, by name.
 
-    Raises LogError: it cannot be read, or its format needs no mapping.
+    Raises LogError: the table cannot be read, or its format needs no mapping.
     """
     from visthrow.logs.readers import recordings, table_to_log
 

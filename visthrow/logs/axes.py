@@ -1,8 +1,7 @@
-"""Exchanges of axes, written as text:
+"""Signed permutations of axes, written as text.
 
-``"x,-y,-z"`` says that our x, y, z are the source's x, its -y and its -z. Onboard-safe.
-
-Of the 48 such sets 24 are turns; the others are mirror images.
+``"x,-y,-z"`` means that our x, y, z are the source's x, -y and -z. Of the 48 permutations, 24 are
+rotations and 24 are mirror images. Onboard-safe.
 """
 
 import re
@@ -10,16 +9,16 @@ from itertools import permutations, product
 
 import numpy as np
 
-OURS = "x,y,z"  # axes that are ours already
+OURS = "x,y,z"  # no permutation
 _AXIS = re.compile(r"[+-]?[xyz]")
 
 
 def matrix_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes, mirror images too:
+    """Return the matrix of a signed permutation, rotation or mirror image.
 
     ``v_ours = matrix @ v_source``, shape (3, 3).
 
-    Raises ValueError: not three signed letters, or one of them twice.
+    Raises ValueError: the text is not x, y and z once each, with or without a sign.
     """
     words = [word.strip() for word in axes.split(",")]
     if (
@@ -35,9 +34,9 @@ def matrix_of(axes: str) -> np.ndarray:
 
 
 def turn_of(axes: str) -> np.ndarray:
-    """Return the matrix of a set of axes that is a turn, shape (3, 3).
+    """Return the matrix of a signed permutation that is a rotation, shape (3, 3).
 
-    Raises ValueError as :func:`matrix_of`, or a mirror image.
+    Raises ValueError as :func:`matrix_of`, or for a mirror image.
     """
     matrix = matrix_of(axes)
     if is_mirror(axes):
@@ -56,7 +55,7 @@ def turn_of(axes: str) -> np.ndarray:
 
 
 def is_mirror(axes: str) -> bool:
-    """Tell whether a set of axes is a mirror image."""
+    """Return whether a signed permutation is a mirror image."""
     return bool(np.linalg.det(matrix_of(axes)) < 0.0)
 
 
@@ -65,7 +64,7 @@ EXCHANGES = tuple(
     for order in permutations("xyz")
     for signs in product(("", "-"), repeat=3)
 )
-"""All 48 sets."""
-TURNS = tuple(axes for axes in EXCHANGES if not is_mirror(axes))  # the 24 that are turns
+"""All 48 signed permutations."""
+TURNS = tuple(axes for axes in EXCHANGES if not is_mirror(axes))  # the 24 rotations
 MATRICES = np.array([matrix_of(axes) for axes in EXCHANGES])
 """Matrix of each of :data:`EXCHANGES`, shape (48, 3, 3)."""

@@ -1,7 +1,8 @@
 """Export of a flight log to tables that other programs read: CSV and parquet.
 
-One row a time stamp of any channel, one column a component; a cell is empty where the channel has
-no valid sample at that time. Column names carry unit and frame: ``pos_w[0] [m, world]``."""
+There is a row for each time stamp of any channel and a column for each component. A cell is empty
+if the channel has no valid sample at that time. Column names state unit and frame:
+``pos_w[0] [m, world]``."""
 
 import csv
 import io
@@ -15,14 +16,14 @@ from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 
 FORMATS = {".csv": ("csv", ""), ".parquet": ("pyarrow", "view")}
-"""Ending of a table -> the module that writes it, and the extra that brings it."""
+"""File extension -> the module that writes it, and the extra that installs the module."""
 
 
 def export(log: FlightLog, path: str | Path) -> None:
-    """Write a flight log as ``.csv`` or ``.parquet``, by the ending of the path; parquet carries
-    the metadata along.
+    """Write a flight log as ``.csv`` or ``.parquet``, by the extension of the path; parquet also
+    holds the metadata.
 
-    Raises LogError if the ending is neither; StorageError if the place cannot be written.
+    Raises LogError for another extension; StorageError if the file cannot be written.
     """
     ending = Path(path).suffix
     if ending == ".csv":
@@ -34,10 +35,10 @@ def export(log: FlightLog, path: str | Path) -> None:
 
 
 def columns(log: FlightLog) -> dict[str, np.ma.MaskedArray]:
-    """Lay all channels on the union of their time stamps.
+    """Arrange all channels on the union of their time stamps.
 
     Returns column name -> values, shape (N,), masked where there is no valid sample; ``time [s]``
-    first."""
+    is first."""
     stamps = [channel.time for channel in log.channels.values()]
     time = np.unique(np.concatenate(stamps)) if stamps else np.empty(0)
     table = {"time [s]": np.ma.array(time)}

@@ -1,8 +1,8 @@
-"""The record of one flight: channels, each with its own time stamps, and what is known about the
-flight as a whole. `STANDARD_CHANNELS`, of ``flightlog.toml``, lists the channels.
+"""The record of one flight: channels, each with its own time stamps, and metadata.
 
-Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant
-and flights of a real vehicle, so that whatever reads one reads them all."""
+``flightlog.toml`` lists the channels of standard names (`STANDARD_CHANNELS`). Simulated throws,
+throws of the reference plant and flights of a real vehicle use the same record, so every tool reads
+all of them. Onboard-safe (numpy only)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,7 +23,7 @@ FRAMES = ("world", "body", "camera", "image", "mocap", "none")
 
 @dataclass(frozen=True)
 class ChannelSpec:
-    """The content of a channel of a standard name."""
+    """Unit, frame, shape and meaning of a channel of a standard name."""
 
     unit: str
     frame: str  # one of FRAMES
@@ -39,7 +39,7 @@ def _standard_channels() -> dict[str, ChannelSpec]:
 
 
 STANDARD_CHANNELS = _standard_channels()
-"""Channels of these names hold this, in this unit and frame; other names are free."""
+"""Standard name -> specification of the channel. Channels of other names may hold anything."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Channel:
             object.__setattr__(self, name, array)
 
     def only(self, keep: ndarray) -> "Channel":
-        """Return some of the samples; ``keep``: shape (T,), bool."""
+        """Return the channel with a part of its samples; ``keep``: shape (T,), bool."""
         return replace(
             self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep]
         )
@@ -103,7 +103,7 @@ class Channel:
         return self.values.reshape(len(self.time), width).astype(float)
 
     def at(self, time: float) -> ndarray:
-        """Return the value at a time [s], linear between samples."""
+        """Interpolate the value at a time [s] linearly."""
         values = [np.interp(time, self.time, column) for column in self.rows.T]
         return np.array(values).reshape(self.values.shape[1:])
 
@@ -113,8 +113,8 @@ class Channel:
         return Samples(self.time[valid], self.rows[valid])
 
     def hold(self, time: ndarray) -> ndarray:
-        """Return the last valid sample at or before each time (the first one where there is none
-        yet).
+        """Return the last valid sample at or before each time; the first valid one if there is none
+        before.
 
         Raises LogError if no sample is valid.
 
@@ -176,7 +176,7 @@ class FlightLog:
         return name in self.channels
 
     def samples(self, name: str, fewest: int = 50) -> Samples | None:
-        """Return the valid samples of a channel; None where the log holds fewer."""
+        """Return the valid samples of a channel; None if there are less than ``fewest``."""
         if name not in self:
             return None
         samples = self[name].samples()
@@ -188,9 +188,8 @@ class FlightLog:
         return notes
 
     def without_estimates(self) -> "FlightLog":
-        """Return the log without the channels that were worked out of others:
-
-        ``estimated`` of the metadata names them.
+        """Return the log without channels that were computed from others (``estimated`` of the
+        metadata names them).
         """
         left_out = self.meta.get("estimated", ())
         return FlightLog(
@@ -199,9 +198,9 @@ class FlightLog:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the log as an ``.npz`` without pickle, whole or not at all.
+        """Write the log atomically as an ``.npz`` without pickle.
 
-        Raises LogError if the metadata cannot be written as JSON; StorageError if the place cannot
+        Raises LogError if the metadata cannot be written as JSON; StorageError if the file cannot
         be written."""
         units = {
             name: {"unit": channel.unit, "frame": channel.frame}
@@ -227,8 +226,8 @@ class FlightLog:
     def load(path: str | Path) -> "FlightLog":
         """Read a log.
 
-        Raises LogError if the file is missing, cut short, of another version, incomplete, or
-        contradicts itself.
+        Raises LogError if the file is missing, truncated, of another version, incomplete or
+        inconsistent.
         """
         arrays = loadz(path, LogError, "a flight log")
         try:
@@ -262,16 +261,16 @@ class FlightLog:
 
 
 class FlightRecorder:
-    """Collects samples one by one and becomes a ``FlightLog``; what it is given is copied."""
+    """A recorder that collects copies of samples one by one and turns them into a ``FlightLog``."""
 
     def __init__(self, meta: Mapping[str, Any] | None = None):
-        """Start empty, with metadata of the flight."""
+        """Create a recorder without samples; ``meta``: metadata of the flight."""
         self.meta = dict(meta or {})
         self._samples: dict[str, list[tuple[float, ndarray, bool]]] = {}
         self._units: dict[str, tuple[str, str]] = {}
 
     def declare(self, name: str, unit: str, frame: str = "none") -> None:
-        """Give a channel that has no standard name its unit and frame."""
+        """Set unit and frame of a channel without a standard name."""
         self._units[name] = (unit, frame)
 
     def add(self, time: float, valid: bool = True, **values: Any) -> None:
@@ -281,8 +280,8 @@ class FlightRecorder:
 
         Args:
             time: [s].
-            valid: Whether these samples are good.
-            **values: One sample a channel: number, bool or array.
+            valid: Whether these samples are valid.
+            **values: One sample per channel: number, bool or array.
         """
         for name, value in values.items():
             if name not in self._units:
@@ -294,10 +293,10 @@ class FlightRecorder:
             self._samples.setdefault(name, []).append((time, np.array(value), valid))
 
     def log(self) -> FlightLog:
-        """Return what was recorded so far.
+        """Return the log of all samples so far.
 
-        Raises LogError if samples of one channel do not fit together; the message names the
-        channel.
+        Raises LogError if samples of one channel differ in shape or do not increase in time; the
+        message names the channel.
         """
         channels = {}
         for name, samples in self._samples.items():

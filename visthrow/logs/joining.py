@@ -1,9 +1,9 @@
-"""Several logs of one flight, each on a clock of its own, as one flight log: what was measured
-twice tells how they lie.
+"""Joining of several logs of one flight, each with its own clock, into one flight log.
 
-``LOG00001.BFL+mocap.csv`` names such a flight. Body rates by gyro and by attitude, positions, or
-accelerations are compared; the first log's clock counts. What a log worked out of its other
-channels (``estimated`` of its metadata) is not compared."""
+``LOG00001.BFL+mocap.csv`` names such a flight. The offsets of the clocks follow from quantities
+that two logs measured: body rates (by gyro or attitude), velocities, or accelerations. The result
+is on the first log's clock. Channels that a log estimated from its other channels (``estimated`` of
+its metadata) are not compared."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,20 +17,20 @@ from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
 
-RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
-# correlation of what was measured twice, below which two logs are not taken for one flight
+RATE = 50.0  # sampling rate of the coarse search for the offset [Hz]
+# correlation of a common quantity below which two logs are not of one flight
 THRESHOLD = 0.6
-_FINE = 0.1  # around the coarse answer [s]
-_SPAN = 0.1  # of turns: rates of attitudes with 0.2 deg of noise are good to 0.05 rad/s then [s]
-_STEP = 0.001  # of lags there, through whose best three a parabola is laid [s]
-_FINE_RATE = 200.0  # of samples compared there [Hz]
+_FINE = 0.1  # range of the fine search, on both sides of the coarse offset [s]
+_SPAN = 0.1  # averaging time of body rates [s]: 0.2 deg of attitude noise become 0.05 rad/s
+_STEP = 0.001  # step of the fine search [s]; a parabola through the best three refines it
+_FINE_RATE = 200.0  # sampling rate of the fine search [Hz]
 
 
 def join(logs: Sequence[FlightLog]) -> FlightLog:
-    """Put logs of one flight together; of a channel that several measured, the first log's stays,
-    and an estimated one where none did.
+    """Join the logs of one flight. Of a channel in several logs, the first measured one is kept; an
+    estimated one is kept only if no log measured it.
 
-    Raises LogError: nothing was measured in both, or it does not go together.
+    Raises LogError: no quantity is measured in both logs, or it does not correlate.
     """
     whole, *other_logs = logs
     channels = dict(whole.channels)
@@ -60,10 +60,10 @@ def join(logs: Sequence[FlightLog]) -> FlightLog:
 
 
 def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
-    """Return what to add to the second log's times [s], the correlation then, and by which
-    quantity.
+    """Return the offset to be added to the second log's times [s], the correlation with it, and the
+    name of the compared quantity.
 
-    Raises LogError: nothing was measured in both, or it does not go together.
+    Raises LogError: no quantity is measured in both logs, or it does not correlate.
     """
     tried = []
     for method, signal in (("body rates", _compute_rates), ("speed", _velocity), ("force", _force)):
@@ -87,7 +87,7 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
 
 
 def _compute_rates(log: FlightLog) -> Samples | None:
-    """Body rates over ``_SPAN``: by gyro, else by attitude."""
+    """Return body rates averaged over ``_SPAN``, from the gyro, else from the attitude."""
     if "rate_b" not in log:
         return log["quat_wb"].samples().rates(_SPAN) if "quat_wb" in log else None
     rates = log["rate_b"].samples()
@@ -105,7 +105,7 @@ def _velocity(log: FlightLog) -> Samples | None:
 
 
 def _force(log: FlightLog) -> Samples | None:
-    """Size of the specific force: the accelerometer's axes turn in the world."""
+    """Return the magnitude of the specific force, which does not depend on the attitude."""
     if "acc_b" in log:
         return _magnitude(*log["acc_b"].samples())
     if "pos_w" not in log:
@@ -119,10 +119,11 @@ def _magnitude(time: ndarray, values: ndarray) -> Samples:
 
 
 def _lag(a: Samples, b: Samples) -> tuple[float, float]:
-    """Offset of the second [s] and the correlation of sizes, which no axes change.
+    """Return the offset of the second signal [s] and the correlation of the magnitudes, which do
+    not depend on the axes.
 
-    All lags at once by Fourier transform of the sizes; about the best one by one, the components in
-    the axes that fit best."""
+    A coarse search correlates magnitudes at all lags by Fourier transform. A fine search around its
+    result compares the components after the best rotation of the axes."""
     sizes = _magnitude(*a), _magnitude(*b)
     grids = [np.arange(time[0], time[-1], 1.0 / RATE) for time, _ in sizes]
     x, y = (
@@ -140,8 +141,8 @@ def _lag(a: Samples, b: Samples) -> tuple[float, float]:
 
 
 def _vertex(scores: ndarray, index: int) -> float:
-    """Return where the parabola through a peak and its neighbours is highest, in steps from the
-    peak; 0 where it lacks a neighbour or they are level.
+    """Return the vertex of the parabola through a peak and its neighbours, in steps from the peak;
+    0 if a neighbour is missing or the three are equal.
     """
     if not 0 < index < len(scores) - 1:
         return 0.0
@@ -151,8 +152,8 @@ def _vertex(scores: ndarray, index: int) -> float:
 
 
 def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[ndarray, ndarray]:
-    """Values of both on a grid of the first's clock, the same for any offset, where
-    there are both.
+    """Return values of both signals on a grid of the first one's clock, where they overlap. The
+    grid does not depend on the offset.
     """
     grid = np.arange(a[0][0], a[0][-1], 1.0 / _FINE_RATE)
     grid = grid[(grid > b[0][0] + offset) & (grid < b[0][-1] + offset)]
@@ -160,8 +161,8 @@ def _resample_both(a: Samples, b: Samples, offset: float) -> tuple[ndarray, ndar
 
 
 def _alignment(x: ndarray, y: ndarray) -> float:
-    """Correlation of components once one is turned, or mirrored, to fit the other best: the sum of
-    the covariance's singular values.
+    """Return the correlation of the components after the best rotation or reflection of one signal:
+    the normalised sum of the covariance's singular values.
     """
     if len(x) < RATE:
         return -1.0

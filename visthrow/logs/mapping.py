@@ -1,6 +1,4 @@
-"""The mapping file: which columns of a table become which channels, in which unit, about which
-axes, on which clock.
-"""
+"""The mapping file: for each channel, the table's columns, their unit, axes and clock."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -19,17 +17,17 @@ _ORDERS = ("xyzw", "wxyz")
 
 @dataclass(frozen=True)
 class TimeColumn(Bounded):
-    """A clock: a column of stamps, or rows that are evenly spaced.
+    """A clock: a column of time stamps, or evenly spaced rows.
 
-    Raises ConfigError: neither or both of them, or no unit of time.
+    Raises ConfigError: neither or both are given, or the unit is not one of time.
     """
 
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
-    row_period: NotNegative = 0.0  # between two rows [s], where there is no column
-    # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
+    row_period: NotNegative = 0.0  # time between two rows [s], if there is no column
+    # added to the times [s], for streams with different clocks; `diagnose check` reports the value
     offset: float = 0.0
-    # file's name -> what is added besides to the times of that flight alone [s]
+    # file name -> offset that is added to the times of that flight only [s]
     offsets: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -48,25 +46,23 @@ class ChannelMap(Bounded):
     channel cannot have.
     """
 
-    # of the channel; those of visthrow.logs.flightlog.STANDARD_CHANNELS have a meaning, others are
-    # free
+    # of the channel: one of visthrow.logs.flightlog.STANDARD_CHANNELS, or any other
     name: str
-    columns: tuple[str, ...]  # "-pitch": of the column "pitch", negated
+    columns: tuple[str, ...]  # "-pitch": the column "pitch", negated
     unit: str  # of the columns
-    # euler: roll, pitch, yaw; yaw is turned first. rotvec: axis times angle. matrix: nine numbers,
-    # column after column
+    # euler: roll, pitch, yaw; the yaw rotation comes first. rotvec: axis times angle. matrix: nine
+    # numbers, column by column
     kind: Literal["vector", "quaternion", "euler", "rotvec", "matrix"] = "vector"
     order: Literal["xyzw", "wxyz"] = "xyzw"  # of a quaternion's columns
-    # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": as they come
+    # our x, y, z in the source's axes, such as "x,-y,-z" for north-east-down; "": unchanged
     axes: str = ""
     body_axes: str = ""  # of an attitude: our body's x, y, z in the source's body axes
-    frame: str = ""  # of a free channel; "": none
-    scale: float = 1.0  # the column is multiplied by it, before its unit
-    offset: float = 0.0  # and this is added then, in the column's unit
-    held: bool = (
-        False  # between measurements the table repeats the last one; repetitions are left out
-    )
-    clock: str = ""  # of the setup's further clocks; "": the main one
+    frame: str = ""  # of a channel without a standard name; "": none
+    scale: float = 1.0  # factor on the column, applied before the unit
+    offset: float = 0.0  # added after the factor, in the column's unit
+    # the table repeats the last value between measurements; repetitions are removed
+    held: bool = False
+    clock: str = ""  # name of a further clock of the mapping; "": the main one
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,7 +70,7 @@ class ChannelMap(Bounded):
         to_si(self.unit, where)
         if not self.columns:
             raise ConfigError(f"{where}: no columns")
-        # a program's own words pass no loader, which would refuse others
+        # the loader checks these words, but not if a program creates the object
         for what, word, known in (("kind", self.kind, _KINDS), ("order", self.order, _ORDERS)):
             if word not in known:
                 raise ConfigError(f"{where}: {what} '{word}'; {suggest(word, known)}")
@@ -106,21 +102,21 @@ class ChannelMap(Bounded):
 class Split(Bounded):
     """The rule that splits one table into several logs."""
 
-    column: str = ""  # a log for each of its values; "": one
-    gap: NotNegative = 0.0  # a new log begins where no row comes for so long [s]; 0: never
-    shortest: NotNegative = 0.0  # shorter ones are left out [s]
+    column: str = ""  # each of its values makes a log; "": one log
+    gap: NotNegative = 0.0  # shortest time without rows at which a new log begins [s]; 0: never
+    shortest: NotNegative = 0.0  # shorter logs are dropped [s]
 
 
 @dataclass(frozen=True)
 class TableMap:
-    """Mapping of a table's columns.
+    """Mapping of a table's columns to channels.
 
-    Raises ConfigError: two channels of one name, or a clock that is not defined.
+    Raises ConfigError: two channels have the same name, or a clock is not defined.
     """
 
     time: TimeColumn
     channels: tuple[ChannelMap, ...]
-    clocks: dict[str, TimeColumn] | None = None  # further ones, by name
+    clocks: dict[str, TimeColumn] | None = None  # further clocks, by name
     split: Split | None = None
 
     def __post_init__(self) -> None:
@@ -135,16 +131,16 @@ class TableMap:
 
     @property
     def columns(self) -> set[str]:
-        """Columns that are read, of clocks and channels."""
+        """Names of the columns that clocks and channels use."""
         clocks = [self.time, *(self.clocks or {}).values()]
         channels = [c.removeprefix("-") for channel in self.channels for c in channel.columns]
         return {clock.column for clock in clocks} | set(channels)
 
     def entry(self, name: str) -> ChannelMap | None:
-        """Return the mapping of a channel; None where it has none."""
+        """Return the mapping of a channel; None if there is none."""
         return next((channel for channel in self.channels if channel.name == name), None)
 
     def with_entry(self, entry: ChannelMap) -> "TableMap":
-        """Return the mapping with another entry in the place of that of its name."""
+        """Return a copy in which an entry replaces the one of the same name."""
         channels = [entry if c.name == entry.name else c for c in self.channels]
         return replace(self, channels=tuple(channels))

@@ -1,4 +1,4 @@
-"""Samples of one quantity and their calculus: values between samples, derivatives, means.
+"""Samples of one quantity, with interpolation, derivatives and means.
 
 Onboard-safe (numpy only)."""
 
@@ -17,20 +17,20 @@ class Samples(NamedTuple):
     values: ndarray  # shape (N, components)
 
     def at(self, times: ndarray) -> ndarray:
-        """Interpolate linearly, column by column, at times of shape (..., M): shape
+        """Interpolate linearly, column by column. ``times``: shape (..., M); returns shape
         (..., M, components).
         """
         return interpolate(self.time, self.values, times)
 
     def attitudes(self, times: ndarray) -> ndarray:
-        """Attitudes between samples of attitudes xyzw, unit quaternions, straight through those of
-        the samples.
-        """
+        """Interpolate attitudes (unit quaternions, xyzw) linearly and normalise them, shape (M, 4).
+
+        ``times``: shape (M,)."""
         between = interpolate(self.time, continuous(self.values), times)
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
     def mean_over(self, times: ndarray, span: float) -> ndarray:
-        """Mean over ``span`` seconds about each time, shape (M, components)."""
+        """Return the mean over ``span`` seconds centred at each time, shape (M, components)."""
         steps = 0.5 * (self.values[1:] + self.values[:-1]) * np.diff(self.time)[:, None]
         whole = np.vstack([0.0 * self.values[:1], np.cumsum(steps, axis=0)])
         ends = np.stack([times - 0.5 * span, times + 0.5 * span])
@@ -38,14 +38,14 @@ class Samples(NamedTuple):
         return (end - begin) / span
 
     def derivative(self, span: float = 0.06) -> "Samples":
-        """Return the derivative over about ``span`` seconds, or two periods where these are longer;
-        gaps are left out.
+        """Return the derivative by central differences over about ``span`` seconds, at least two
+        periods; differences across gaps are left out.
         """
         first, last, middle, width = self._pairs(span)
         return Samples(middle, (self.values[last] - self.values[first]) / width[:, None])
 
     def rates(self, span: float = 0.06) -> "Samples":
-        """Return body rates [rad/s] of attitudes xyzw, over about ``span`` seconds as in
+        """Return the body rates [rad/s] of attitudes xyzw, by differences as in
         :meth:`derivative`.
         """
         first, last, middle, width = self._pairs(span)
@@ -55,8 +55,8 @@ class Samples(NamedTuple):
         return Samples(middle, turns / width[:, None])
 
     def _pairs(self, span: float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """First and last sample of each stretch of about ``span``, the time in its middle [s] and
-        its width [s].
+        """Return, for all differences over about ``span``, indices of first and last sample, time
+        of the middle [s] and width [s].
         """
         time = self.time
         period = np.median(np.diff(time)) if len(time) > 2 else 1.0
@@ -70,7 +70,7 @@ class Samples(NamedTuple):
 
 
 def interpolate(time: ndarray, values: ndarray, grid: ndarray) -> ndarray:
-    """Interpolate linearly, column by column: values of shape (T, C) at times of shape (..., N),
-    shape (..., N, C).
+    """Interpolate values of shape (T, C) linearly, column by column, at times of shape (..., N);
+    returns shape (..., N, C).
     """
     return np.stack([np.interp(grid, time, column) for column in values.T], -1)

@@ -1,3 +1,3 @@
-"""What can be said of flight logs before any model is asked: each channel, units, axes, signs and
-delays by physics, what is excited.
+"""Checks of flight logs without a model: each channel by itself; units, axes, signs and delays by
+physics; excitation.
 """

@@ -1,4 +1,4 @@
-"""What a log excites, and what it can therefore answer."""
+"""Excitation of a log's motion, and the questions that the log can therefore answer."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,19 +18,18 @@ POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
 MOTORS = ("motor_command", "motor_speed", "pwm")
 THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
-# a vehicle whose position keeps within this [m] for the whole log has not flown, if its motors
-# stood or nothing tells
+# range of positions [m] below which a vehicle has not flown, if its motors idled or are unknown
 STILL_SPEED = 0.01
 
 
 @dataclass(frozen=True)
 class Question:
-    """Something that logs can answer, and what it takes."""
+    """A question that logs can answer, with the channels and the excitation that it needs."""
 
     name: str
-    needs: tuple[tuple[str, ...], ...]  # each: any one of these channels
-    excited: str  # figure of the excitation that must reach a size
-    least: float
+    needs: tuple[tuple[str, ...], ...]  # groups of channels, of each of which any one is needed
+    excited: str  # key of the figure of :func:`excitation` that is needed
+    least: float  # smallest value of that figure
 
 
 def _questions() -> tuple[Question, ...]:
@@ -50,7 +49,7 @@ QUESTIONS = _questions()
 
 
 def look(log: FlightLog) -> Iterator[Row]:
-    """Yield what is excited, and which questions the log can answer."""
+    """Yield rows on the excitation and on each question that the log may answer."""
     figures = excitation(log)
     yield Row("excited", "", "ok", _words(figures), figures)
     if figures.get("still"):
@@ -62,7 +61,7 @@ def look(log: FlightLog) -> Iterator[Row]:
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
         yield Row("excited", "", "bad", text, {"idle": 1})
     for question in QUESTIONS:
-        # not things of which the log holds nothing at all
+        # skip questions on quantities that the log does not hold at all
         if any(name in log for name in question.needs[0]):
             yield _answer(question, log, figures)
 
@@ -103,8 +102,8 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
 def _find_first(
     log: FlightLog, names: tuple[str, ...], fewest: int = 21
 ) -> tuple[str, Samples] | tuple[None, None]:
-    """Name and samples of the first of several channels that holds so many; None and None without
-    one.
+    """Return name and samples of the first of several channels that has at least ``fewest``
+    samples; (None, None) if none has.
     """
     for name in names:
         samples = log.samples(name, fewest)
@@ -114,7 +113,9 @@ def _find_first(
 
 
 def excitation(log: FlightLog) -> dict[str, float]:
-    """Figures of what a log excites; what no channel tells is left out."""
+    """Return figures of a log's excitation, units in their names; figures without a channel are
+    absent.
+    """
     spans = [np.ptp(channel.time) for channel in log.channels.values() if len(channel.time) > 1]
     figures = {"seconds": max(spans, default=0.0)}
     flown = _find_flight(log, figures)
@@ -126,7 +127,9 @@ def excitation(log: FlightLog) -> dict[str, float]:
 
 
 def _find_flight(log: FlightLog, figures: dict) -> tuple[float, float]:
-    """First and last time in the air, by height or by thrust."""
+    """Return the first and last time in the air [s], by height and by the channel ``flying``.
+
+    Returns (-inf, inf) where neither shows it, and (inf, -inf) where ``flying`` is never set."""
     _, path = _find_first(log, POSITIONS)
     if path is None:
         return -np.inf, np.inf
@@ -166,7 +169,7 @@ def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
 
 
 def _range(values: np.ndarray, part: float) -> np.ndarray:
-    """Return the range of each column without so many per cent at either end."""
+    """Return the range of each column without ``part`` per cent at either end."""
     low, high = np.percentile(values, [part, 100 - part], axis=0)
     return high - low
 

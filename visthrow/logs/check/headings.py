@@ -1,4 +1,4 @@
-"""By which angle about z the frame of a path is turned beside that of an attitude."""
+"""Angle about z between the frame of a path and the frame of an attitude."""
 
 from dataclasses import dataclass
 
@@ -6,37 +6,38 @@ import numpy as np
 
 from visthrow.logs.check import relations
 
-# of a capture's frame after a wand calibration, deviation [rad]: the prior of frame_tilt_x
+# sd of a capture frame's angle after a wand calibration [rad], as in the prior of frame_tilt_x
 _ALIGNED = 0.0175
 
 
 @dataclass(frozen=True)
 class Turn:
-    """The angle by which level accelerations are turned beside the push that makes them."""
+    """Angle about z from the thrust's horizontal acceleration to the measured one."""
 
     angle: float  # [rad]
     sd: float  # [rad]
-    nats: float  # by which any angle explains them better than one of a calibrated frame
-    alone: float  # share of the push's power that no delay, drag or wind makes as well
+    nats: float  # evidence for a free angle over the angle of a calibrated frame
+    alone: float  # share of the thrust's power that delay, drag and wind cannot explain
 
 
 def turn_of(time: np.ndarray, acc: np.ndarray, pushed: np.ndarray, velocity: np.ndarray) -> Turn:
-    """Return the angle by which a path is turned beside what pushes the vehicle.
+    """Return the angle about z by which a path is turned relative to the thrust's direction.
 
-    As complex numbers x + i y, accelerations are those of the push times one factor, whose angle is
-    the turn. Beside it stand the push's derivative, for a stream may be late, the velocity, for
-    drag, and a constant, for wind: on a circle drag turns as well. What other bodies pull is in the
-    misfit: the factor's deviation is that by which stretches of the flight disagree.
+    Horizontal accelerations, written as complex numbers x + i y, are the thrust's acceleration
+    times one factor, whose angle is the turn. Further regressors are the thrust's derivative (a
+    delayed stream), the velocity (drag, which on a circle looks like a turn) and a constant (wind).
+    Forces of other bodies stay in the residual. So the factor's standard deviation is derived from
+    the scatter between blocks of the flight.
 
     Args:
         time: of all samples [s], shape (N,).
         acc: of the path [m/s^2], shape (N, 3).
-        pushed: acceleration that the attitude's push would make [m/s^2], shape (N, 3).
+        pushed: acceleration by the thrust, along the attitude's axis [m/s^2], shape (N, 3).
         velocity: of the path [m/s], shape (N, 3).
     """
     force, level, speed = (v[:, 0] + 1j * v[:, 1] for v in (pushed, acc, velocity))
     beside = np.column_stack([np.gradient(force, time), speed, np.ones_like(force)])
-    # of the push, what no delay, drag or wind does as well
+    # part of the thrust's acceleration that is orthogonal to the other regressors
     alone = force - beside @ np.linalg.lstsq(beside, force, rcond=None)[0]
     power = np.vdot(alone, alone).real
     share = float(power / max(np.vdot(force, force).real, 1e-300))

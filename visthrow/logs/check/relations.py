@@ -1,4 +1,4 @@
-"""How two measurements of the same motion relate: delay, axes, sign, scale, or not at all."""
+"""Relation of two measurements of the same motion: delay, axes, sign, scale and correlation."""
 
 from dataclasses import dataclass
 
@@ -8,20 +8,21 @@ from numpy.polynomial.polynomial import polyfit
 from visthrow.logs.axes import EXCHANGES, MATRICES
 from visthrow.logs.samples import Samples
 
-REACH = 0.4  # largest delay looked for [s]
-# of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
+REACH = 0.4  # largest delay in the search [s]
+# largest distance of a ratio's logarithm from a unit's: noise dilutes, cables pull, filters smooth
 _UNIT = 0.25
-_LONGEST_GRID = 60_000  # samples; longer stretches are thinned
+_LONGEST_GRID = 60_000  # samples; longer signals are sampled more coarsely
 
-BLOCKS = 16  # of a stretch, whose disagreement about a delay is its deviation
-_ROUNDS = 5  # of weighing blocks by their noise
-_WIDTH = 0.04  # half the width of the narrowest parabola that is laid through a peak [s]
-_NATS = 10.0  # of likelihood that a peak must have over its sides, so that noise does not make it
-# where the rest goes together by so much, a block that leaves so many times the middle one is of
-# something else, as a crash
+BLOCKS = 16  # parts of a signal; the scatter between them gives a delay's standard deviation
+_ROUNDS = 5  # iterations in which blocks are weighted by their noise
+_WIDTH = 0.04  # half the width of the narrowest parabola that is fitted to a peak [s]
+_NATS = 10.0  # log-likelihood that a peak must have over its sides, so that it is not noise
+# If the weighted correlation exceeds _TOGETHER, a block with more than _TUMBLE times the median
+# residual holds another motion, such as a crash.
 _TOGETHER = 0.7
 _TUMBLE = 25.0
-# 95 % of Student's t of 7 degrees of freedom, those of 8 pairs of blocks, over the normal's
+# ratio of the 95 % quantiles of Student's t, with 7 degrees of freedom (8 pairs of blocks), and of
+# the normal distribution
 _STUDENT = 2.365 / 1.960
 
 # samples of a flight this far apart [s] count as independent where evidence is weighed
@@ -33,7 +34,7 @@ UNITS = {
     9.80665: "one is in g, or in tenths, as mm taken for cm",
     100.0: "one is in hundredths",
 }
-"""Ratio of the larger to the smaller -> what it gives away."""
+"""Ratio of the larger signal to the smaller one -> the wrong unit that it suggests."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,13 @@ class Relation:
     axes: str  # best exchange of axes: what x, y, z of the second are in the first
     axes_correlation: float  # with that exchange
     axes_delay: float  # of the second behind the first with that exchange [s]
-    nats: float  # by which that exchange beats the axes as they are, the choice among 48 paid for
+    nats: float  # evidence for that exchange over the axes as they are, less a penalty for 48
 
 
 def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | None:
     """Relate two signals of one or three components; ``reach``: largest delay [s].
 
-    Returns None where they overlap too little or do not move.
+    Returns None if they overlap too little or do not move.
     """
     clocks = first.time, second.time
     if min(map(len, clocks)) < 2:
@@ -78,14 +79,17 @@ def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | 
 def _relate(
     values: np.ndarray, around: np.ndarray, places: np.ndarray, period: float, steps: int
 ) -> tuple[Relation | None, np.ndarray]:
-    """Relation at some places of a grid, and which of them go with the rest.
+    """Relate two signals at some points of a grid, and find the points that agree with the rest.
 
     Args:
-        values: of the first signal at the places, shape (N, A).
-        around: of the second on the grid, continued by the steps at both ends, shape (M, A).
-        places: numbers on the grid, shape (N,).
+        values: of the first signal at the points, shape (N, A).
+        around: of the second on the grid, extended by ``steps`` at both ends, shape (M, A).
+        places: indices of the points on the grid, shape (N,).
         period: of the grid [s].
-        steps: by which the second is moved at most.
+        steps: largest shift of the second signal.
+
+    Returns:
+        The relation, None if a signal does not move; and whether each point agrees, shape (N,).
     """
     count = len(places)
     centred = values - np.mean(values, axis=0)
@@ -135,8 +139,8 @@ def _relate(
 
 
 def _best_axes(correlations: np.ndarray) -> tuple[str, float, int]:
-    """Return the exchange of axes in which two signals go together best, with their correlation and
-    the lag; ``correlations``: of their components by lag, shape (A, B, K).
+    """Return the exchange of axes in which two signals correlate best, their correlation and the
+    index of the lag; ``correlations``: of their components by lag, shape (A, B, K).
     """
     exchanges, matrices = EXCHANGES, MATRICES
     if correlations.shape[0] != 3:
@@ -148,24 +152,24 @@ def _best_axes(correlations: np.ndarray) -> tuple[str, float, int]:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """Two signals of a stretch, by blocks of it, each of which has a noise of its own: a tumble,
-    after which nothing follows anything, weighs as little as its noise is large.
-    """
+    """Products of two signals by block, each with a noise level of its own.
+
+    A block in which the signals disagree, such as a tumble, has a small weight."""
 
     xx: np.ndarray  # power of the first signal in each block, shape (K,)
     xy: np.ndarray  # its product with the second at each lag, shape (L, K)
     yy: np.ndarray  # power of the second, shape (L, K)
-    independent: float  # number of samples that count as independent
+    independent: float  # number of independent samples
 
     def delay(self, half: int) -> tuple[float, float, np.ndarray, float]:
-        """Lag at which the second signal follows the first best, and its deviation [steps].
+        """Return the lag at which the second signal follows the first best [steps].
 
-        A parabola is laid through the peak of the correlation; how much the blocks disagree about
-        its slope is the deviation, whatever the noise is correlated with, as long as two blocks
-        last longer. ``half``: half the width of the narrowest parabola [steps].
+        A parabola is fitted to the peak of the correlation. The scatter of its slope between blocks
+        gives the lag's standard deviation, also for correlated noise, if its correlation time is
+        shorter than two blocks. ``half``: half the width of the narrowest parabola [steps].
 
-        Returns lag, its deviation, what each block leaves, shape (K,), and the weighted
-        correlation."""
+        Returns the lag, its standard deviation (infinite without a clear peak), the residual power
+        of each block, shape (K,), and the weighted correlation."""
         xx, xy, yy = self.xx, self.xy, self.yy
         scale = np.sum(xy, axis=1) / max(np.sum(xx), 1e-300)
         for _ in range(_ROUNDS):
@@ -178,8 +182,8 @@ class _Blocks:
         cross, first, second = (np.sum(part / residual[best]) for part in (xy[best], xx, yy[best]))
         together = cross / max(np.sqrt(first * second), 1e-300)
         while 2 * half < len(likelihood):
-            # the middle of the window in which the second follows best: of a slow motion noise
-            # alone would make the peak of a narrow one
+            # Centre of the window with the largest mean likelihood. For a slow motion, the peak
+            # within a narrow window would be noise.
             width = 2 * half + 1
             mean = np.convolve(likelihood, np.full(width, 1.0 / width), "valid")
             best = int(np.argmax(mean)) + half
@@ -193,25 +197,25 @@ class _Blocks:
 
     @property
     def _floor(self) -> float:
-        """Least that a block leaves."""
+        """Smallest residual power of a block."""
         return 1e-6 * np.mean(self.yy)
 
     def _vertex(self, xy: np.ndarray, yy: np.ndarray, half: int) -> tuple[float, float]:
-        """Peak of a correlation of which each block has parabolas, and its deviation [steps];
-        infinite where noise alone may make such a peak.
+        """Return the peak of a correlation and its standard deviation [steps], infinite if noise
+        alone may cause such a peak.
 
-        The peak is that of the correlation's logarithm, so that noise of neither signal, nor one of
-        them that is larger at one end, pulls it aside.
+        The peak is found in the logarithm of the correlation. So neither noise nor a signal that is
+        larger at one end shifts it.
 
         Args:
-            xy: Parabolas of the signals' product, powers 0 to 2, shape (3, K).
-            yy: Those of the second's power.
+            xy: Parabola of the signals' product in each block, powers 0 to 2, shape (3, K).
+            yy: Parabola of the second signal's power in each block, shape (3, K).
             half: Half the width of the parabolas [steps].
         """
         xx = self.xx
         vertex = 0.0
         for _ in range(_ROUNDS):
-            # rows: value, slope and bend of a parabola
+            # rows: value, slope and curvature of a parabola
             powers = np.array(
                 [[1.0, vertex, vertex * vertex], [0.0, 1.0, 2.0 * vertex], [0.0, 0.0, 2.0]]
             )
@@ -229,7 +233,7 @@ class _Blocks:
             bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
             slopes = weight * (product[1] / cross[0] - 0.5 * second[1] / power[0])
             explained = min(cross[0] ** 2 / (power[0] * np.sum(weight * xx)), 0.999)
-            # what the second would lose of its likelihood half the parabola's width aside
+            # loss of log-likelihood at a distance of half the parabola's width
             nats = -0.5 * self.independent * bend * half**2 * explained / (1.0 - explained)
             if nats < _NATS or abs(vertex - slope / bend) > half:
                 return vertex, np.inf
@@ -238,17 +242,18 @@ class _Blocks:
 
 
 def variance_of_sum(scores: np.ndarray) -> float:
-    """Return the variance of the sum of blocks' scores, shape (BLOCKS,), whose mean is 0, that
-    Student's quantile makes of their scatter.
+    """Return the variance of the sum of zero-mean scores of blocks, shape (BLOCKS,), from their
+    scatter, enlarged by Student's quantile.
 
-    Noise may last longer than a block: neighbours count together, paired in both ways."""
+    Noise may stay correlated for longer than a block. So neighbours are summed in pairs first, in
+    both ways of pairing."""
     pairs = np.convolve(scores, [1.0, 1.0])
     scatter = 0.5 * np.sum(np.abs(pairs) ** 2) * BLOCKS / (BLOCKS - 2)
     return float(_STUDENT**2 * scatter)
 
 
 def unit_hint(ratio: float) -> str:
-    """Name the unit that a ratio of two measurements suggests, or return nothing."""
+    """Return the text on the wrong unit that a ratio of two measurements suggests; "" if none."""
     for factor, words in UNITS.items():
         if ratio and abs(abs(np.log(abs(ratio))) - np.log(factor)) < _UNIT:
             return words

@@ -1,4 +1,4 @@
-"""One finding a row: topic, channel, verdict, words and figures."""
+"""Rows of a check: one finding each, with topic, channel, verdict, text and figures."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -13,14 +13,14 @@ class Row:
 
     # clock, gaps, values, noise, units, frames, delay, cable, thrust, excited, answers, duplicates
     topic: str
-    channel: str  # that it speaks of; or several; or "" for the whole log
+    channel: str  # or several channels; "": the whole log
     verdict: Verdict
     text: str
     figures: dict[str, Any] = field(default_factory=dict)  # with units in their names
 
     @property
     def name(self) -> str:
-        """Topic and channel, by which it is overruled."""
+        """Topic and channel: the name by which a model overrules the row."""
         return f"{self.topic} {self.channel}".strip()
 
 
@@ -31,12 +31,12 @@ def worst(rows: list[Row]) -> Verdict:
 
 @dataclass(frozen=True)
 class KnownVehicle:
-    """A model's statements about a vehicle."""
+    """What a model states about a vehicle."""
 
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
-    mass: float = 0.0  # of all that flies [kg]; 0: not known
-    thrust_input: str = ""  # channel that the thrust comes from; "": whatever the log holds
-    # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
+    mass: float = 0.0  # of vehicle, cable and payload [kg]; 0: unknown
+    thrust_input: str = ""  # channel from which the thrust follows; "": any that the log holds
+    # polynomial of a motor's thrust (of all motors', for a thrust command), powers 0, 1, 2 [N]
     thrust_map: tuple[float, float, float] | None = None
     # channels that the model does not read, and names of rows that are overruled
     unread: frozenset[str] = frozenset()

@@ -1,5 +1,5 @@
-"""Checks of one channel by itself: its clock, gaps, stuck and saturated values, jumps, and the
-noise of its sensor.
+"""Checks of one channel by itself: clock, gaps, stuck and saturated values, jumps and sensor
+noise.
 """
 
 from collections.abc import Iterator
@@ -12,15 +12,15 @@ from visthrow.logs.flightlog import Channel
 
 MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
-# values that come more slowly than this [s] are settled ones, as a stand's, and so few suffice
+# Values with a longer period [s] are settled ones, such as a thrust stand's: FEW_STEPS suffice.
 SLOW_PERIOD = 0.5
 FEW_STEPS = 5
-SHORT = 0.5  # shorter channels answer nothing [s]
-LONG = 1800.0  # of longer logs only windows spread over them are simulated [s]
+SHORT = 0.5  # shortest duration of a usable channel [s]
+LONG = 1800.0  # of longer logs, only windows spread over the flight are simulated [s]
 
 _GAP_PERIODS = 3.0
 _JITTER_WARN = 0.25  # of a period, 95th percentile
-# a moving vehicle's pose does not stand still to the last digit for so long [s]
+# longest time for which a moving vehicle's pose may repeat to the last digit [s]
 _STUCK_TIME = 0.25
 _RAIL_SHARE = 0.01
 _RAILED = (
@@ -33,18 +33,18 @@ _RAILED = (
     "throttle",
     "motor_speed",
 )
-# channels that rest on one of few values by their nature
+# channels with few possible values
 _SWITCHES = ("release_command", "attached", "flying", "mode")
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
 _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
-"""Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs.
+"""Unit -> rate of change [unit/s] above which a step is a jump: of vehicles, rotors and batteries.
 """
 _NOTES = {
     "repeated": "stamps repeated",
     "backwards": "stamps going back",
     "unstamped": "rows unstamped",
 }
-"""Counts of a reader's notes, in words."""
+"""Key of a count in a reader's notes -> its text."""
 _HARDEST = 30.0  # acceleration of a vehicle or payload that throws [m/s^2]
 _COMMANDED = (
     "setpoint",
@@ -58,16 +58,16 @@ _COMMANDED = (
     "pwm",
     "residual",
 )
-"""Channels of which somebody may ask for a step, or that hold no motion."""
+"""Words of channels that may step, as they are commanded or no motion."""
 _STOPS_AT_ZERO = ("throttle", "motor_command", "command", "motor_output", "pwm", "motor_speed")
 
 
 def highpass_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return the standard deviation of white sensor noise on a smooth signal, unmoved by outliers.
+    """Return the standard deviation of white sensor noise on a smooth signal, robust to outliers.
 
-    Third differences of a motion that is smooth over four samples vanish; those of white noise have
-    20 times its variance. ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: which
-    third differences count. Returns sigma in the values' unit, shape () or (D,).
+    Third differences of a motion that is smooth over four samples vanish. Those of white noise have
+    20 times its variance. ``values``: evenly sampled, shape (T,) or (T, D), T >= 4; ``good``: third
+    differences that are used. Returns sigma in the values' unit, shape () or (D,).
 
     Source: Rousseeuw and Croux 1993 for the median absolute deviation.
     """
@@ -81,7 +81,7 @@ def noise(channel: Channel) -> np.ndarray:
     """Return the standard deviation of the sensor's noise, from third differences of evenly spaced
     samples.
 
-    Returns one value a component, in the channel's unit; NaN where there are too few samples.
+    Returns one value per component, in the channel's unit; NaN if there are too few samples.
     """
     values = channel.rows
     steps = np.diff(channel.time)
@@ -93,14 +93,14 @@ def noise(channel: Channel) -> np.ndarray:
 
 
 def sensor_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
-    """Return :func:`highpass_sigma` of components, shape (D,), or what their rounding leaves where
-    that is more: a rounded component that hardly moves shows no noise.
+    """Return the larger of :func:`highpass_sigma` and the rounding error's deviation, shape (D,): a
+    rounded component that hardly moves shows no noise.
     """
     return np.maximum(highpass_sigma(values, good), _resolution(values) / np.sqrt(12.0))
 
 
 def _resolution(values: np.ndarray) -> np.ndarray:
-    """Smallest step between values, where they come in steps."""
+    """Return the smallest step between the values of each column; 0 for unrounded columns."""
     steps = np.zeros(values.shape[1])
     for i, column in enumerate(values.T):
         distinct = np.unique(column)
@@ -110,8 +110,8 @@ def _resolution(values: np.ndarray) -> np.ndarray:
 
 
 def look(name: str, channel: Channel, notes: dict) -> Iterator[Row]:
-    """Yield the findings of all checks of one channel; ``notes``: what the reader left out; see
-    :func:`visthrow.logs.readers.table_to_log.make_channel`.
+    """Yield the findings of all checks of one channel; ``notes``: the reader's counts of rejected
+    rows, see :func:`visthrow.logs.readers.table_to_log.make_channel`.
     """
     count = len(channel.time)
     span = np.ptp(channel.time) if count else 0.0
@@ -198,7 +198,7 @@ def _values(name: str, channel: Channel) -> Iterator[Row]:
 
 
 def _speaks_of(name: str, words: tuple[str, ...]) -> bool:
-    """Tell whether a channel's name holds one of some words."""
+    """Return whether a channel's name contains one of some words."""
     return any(word in name for word in words)
 
 
@@ -236,7 +236,7 @@ def _check_rails(name: str, values: np.ndarray) -> Iterator[Row]:
         if not stops:
             ends["lowest"] = np.min(column)
         for words, rail in ends.items():
-            share = (np.sum(column == rail) - 1) / len(column)  # one always is
+            share = (np.sum(column == rail) - 1) / len(column)  # one sample always is the extreme
             rails.append((share, f"its {words} value {rail:.6g}"))
     worst, where = max(rails)
     if worst > _RAIL_SHARE:
@@ -245,7 +245,7 @@ def _check_rails(name: str, values: np.ndarray) -> Iterator[Row]:
 
 
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> Iterator[Row]:
-    """Report steps that no motion makes, from sample to sample and across gaps."""
+    """Report steps too fast for a motion, between neighbouring samples and across gaps."""
     if "quat" in name:
         values = continuous(values)
     size = np.linalg.norm(np.diff(values, axis=0), axis=1)
@@ -268,9 +268,7 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> Iterat
 def _jumps_across(
     name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray
 ) -> Iterator[Row]:
-    """Positions that do not go on behind a gap where they went before it: another origin, or
-    another body.
-    """
+    """Report positions that are not continued after a gap: another origin, or another body."""
     off = []
     for i in gaps:
         before = slice(max(i - 8, 0), i + 1)
