@@ -1,7 +1,7 @@
-"""A ball in free flight under motion capture: drag, spin, wind, and what a camera system gets wrong
-about gravity.
+"""A ball in free flight under motion capture: drag, spin, wind, and errors of the capture's frame,
+clock and scale.
 
-The log holds no mass: forces are per kilogram, which is what a path can tell.
+The log holds no mass, and a path determines only accelerations: forces are per kilogram.
 """
 
 from dataclasses import dataclass
@@ -24,24 +24,23 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
 
 CHANNEL = "payload_pos_w"
-# of a free flight's integration: about 10 ms, at which the path is exact to a thousandth of a
-# millimetre
+# integration steps of a free flight: about 10 ms each, at which the path is accurate to 1 um
 STEPS = 80
 FALLS = 0.7
-"""Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast,
-spinning balls; at rest it is 1.
+"""Acceleration minus gravity's, relative to gravity, below which a ball is in flight: fast,
+spinning balls have that much drag and lift; a ball at rest has 1.
 """
 
 
 @dataclass(frozen=True)
 class BallParams(Bounded):
-    """The ball that is assumed before anything is found."""
+    """The ball before any effect is found."""
 
     gravity: Positive  # [m/s^2]
     drag: NotNegative  # k / m of the quadratic drag k |v| v [1/m]
-    edge: NotNegative  # cut off at either end of a free flight [s]
-    shortest: Positive  # free flights [s]
-    every: int = 1  # the samples taken: every n-th
+    edge: NotNegative  # time cut off at either end of a free flight [s]
+    shortest: Positive  # shortest free flight to use [s]
+    every: int = 1  # use every n-th sample
 
 
 class BallModel(NumericModel):
@@ -76,9 +75,9 @@ class BallModel(NumericModel):
         return flights
 
     def simulate(self, lanes: Lanes) -> ndarray:
-        """See the base class; the unknowns are position and velocity at the first stamp.
+        """See the base class; returns position and velocity on the grid.
 
-        Returns them over the grid.
+        The initial state is position and velocity at the first stamp.
         """
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
@@ -119,8 +118,10 @@ class BallModel(NumericModel):
 
 
 def _free(time: ndarray, pos: ndarray, params: BallParams) -> list[tuple[float, float]]:
-    """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth
-    of a second each way.
+    """Return the first and last time of each free flight [s], without ``edge`` at either end.
+
+    A ball is in flight where its acceleration, from two derivatives over 50 ms, is gravity's but
+    for ``FALLS`` of it.
     """
     vel = Samples(time, pos).derivative(0.05)
     if len(vel.time) < 20:

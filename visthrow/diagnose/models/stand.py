@@ -1,8 +1,8 @@
-"""A motor with a propeller on a thrust stand: thrust over speed, and current over the power that
-the propeller takes.
+"""A motor with a propeller on a thrust stand: thrust as a function of speed, and current as a
+function of the propeller's power.
 
-One motor of a kind is not like the other: the latent forces of a test are a share of its thrust and
-of its current."""
+Motors of one type differ: the latent forces of a test are relative changes of its thrust and of its
+current."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,26 +19,26 @@ NEEDED = ("rotor_speed", "thrust", "supply_voltage", "current")
 
 @dataclass(frozen=True)
 class StandParams(Bounded):
-    """The motor and propeller that are assumed before anything is found."""
+    """The motor and propeller before any effect is found."""
 
     k_f: Positive  # thrust over speed squared [N s^2/rad^2]
     k_p: Positive  # electric power over speed cubed [W s^3/rad^3]
     idle_power: NotNegative  # [W]
     resistance: NotNegative  # of motor and leads [Ohm]
     reference_voltage: Positive  # [V]
-    thrust_sd: Positive  # of the load cell [N]
-    thrust_share: NotNegative  # and of the reading [1]
-    current_sd: Positive  # [A]
-    current_share: NotNegative  # [1]
-    lowest_speed: NotNegative  # steps below are left out [rad/s]
+    thrust_sd: Positive  # constant part of the load cell's standard deviation [N]
+    thrust_share: NotNegative  # part proportional to the reading [1]
+    current_sd: Positive  # constant part of the current's standard deviation [A]
+    current_share: NotNegative  # part proportional to the reading [1]
+    lowest_speed: NotNegative  # slower steps are left out [rad/s]
 
 
 class StandModel(NumericModel):
-    """Static steps of tests on one stand; a test is a flight."""
+    """Static steps of tests on one stand; each test counts as a flight."""
 
     lawless = (
-        "its steps are at rest, and what thrust alone could make its gains, exponents and offsets"
-        " stand for"
+        "its steps are at rest, and its gains, exponents and offsets already cover any dependence"
+        " on thrust"
     )
 
     table = "stand"
@@ -58,7 +58,7 @@ class StandModel(NumericModel):
         p = self.params
         if len({len(log[name].time) for name in NEEDED}) != 1:
             return []
-        # speed [rad/s], thrust [N], voltage [V] and current [A] of steps that can be used
+        # speed [rad/s], thrust [N], voltage [V] and current [A] of valid steps
         rows = np.column_stack([log[name].values.astype(float) for name in NEEDED])
         lowest = p.lowest_speed, 0.0, 1.0, 0.0
         valid = np.all([log[name].valid for name in NEEDED], axis=0)

@@ -1,5 +1,5 @@
-"""What drives a quadrotor whose commands were logged: windows in which it flies, and the thrust of
-its motors there.
+"""Base of the models of a quadrotor whose commands were logged: flying windows, and the thrust of
+the motors in them.
 """
 
 from collections.abc import Container, Sequence
@@ -13,8 +13,8 @@ from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, QuadrotorPar
 from visthrow.diagnose.models.quadrotor.flyer_windows import NEIGHBOUR, expect_thrust, lagged
 from visthrow.logs.flightlog import FlightLog
 
-SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
-BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # number of the latent block that a channel shows
+SHORTEST = 1e-3  # shortest lag of the motors [s], which divides
+BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # channel -> index of the latent block that it shows
 
 
 class DrivenModel(NumericModel):
@@ -24,10 +24,9 @@ class DrivenModel(NumericModel):
     knot_count = 8
 
     def __init__(self, logs: Sequence[FlightLog], params: QuadrotorParams):
-        """Cut the flights into windows; the channels that are looked at, that drive the model, and
-        that it needs are known.
+        """Cut the flights into windows; ``channels``, ``inputs`` and ``needed`` must be set before.
 
-        Raises LogError where no log has the channels, or none flies.
+        Raises LogError: no log has the channels, or no log shows a flight.
         """
         blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
         self.pushes = [(block, axis) for block in blocks for axis in range(3)]
@@ -41,18 +40,18 @@ class DrivenModel(NumericModel):
 
     @property
     def has_voltage(self) -> bool:
-        """Whether all logs tell the battery's voltage."""
+        """Return whether all logs hold the battery's voltage."""
         return "battery_voltage" in self.inputs
 
     def catalogue(self) -> list[ModelEffect]:
-        """See the base class; where the voltage is logged, thrust fades with it."""
+        """See the base class; ``thrust_fade`` is left out where the voltage is logged."""
         effects = super().catalogue()
         return [e for e in effects if not (self.has_voltage and e.name == "thrust_fade")]
 
     def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
         """See the base class; at most ``most_windows``, spread evenly.
 
-        Raises LogError: the commands' thrust is not that which carries the vehicle.
+        Raises LogError: the commands' thrust is far above the weight.
         """
         stretches = super().cut(logs)
         limit = self.params.most_windows
@@ -65,16 +64,16 @@ class DrivenModel(NumericModel):
             expect_thrust(stretches, self.params)
         if len(stretches) <= limit:
             return stretches
-        self.notes = (*self.notes, f"long flights: {limit} windows are looked at, spread over all")
+        self.notes = (*self.notes, f"long flights: only {limit} windows are used, spread evenly")
         chosen = np.linspace(0, len(stretches) - 1, limit).round().astype(int)
         return [stretches[i] for i in chosen]
 
     def thrusts(self, lanes: Lanes, steps: int) -> ndarray:
-        """Thrust of each motor at the half steps of a window [N], shape (half steps, B, motors): of
-        held commands by the map, through a lag.
+        """Return the thrust of each motor at the half steps of a window [N], shape (half steps, B,
+        motors): the map's for the held commands, with lag.
 
-        In the middle of a step stands what makes Simpson's rule, and so the integration, give the
-        step's own mean: commands switch there."""
+        The value in the middle of a step is such that Simpson's rule, and hence the integration,
+        gives the exact mean over the step, although commands may change within it."""
         p = self.params
         step = p.step * self.steps / steps
         grid = 0.5 * step * np.arange(2 * steps + 1)[:, None]
@@ -100,7 +99,7 @@ class DrivenModel(NumericModel):
         return thrust * self._scale(lanes) * curved * faded[..., None]
 
     def _scale(self, lanes: Lanes) -> ndarray:
-        """Thrust over what the map says, shape (B, motors)."""
+        """Return the ratio of each motor's thrust to the map's, shape (B, motors)."""
         p = self.params
         volts = np.zeros(len(lanes.owner))
         if self.has_voltage:

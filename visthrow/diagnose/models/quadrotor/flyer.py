@@ -1,9 +1,9 @@
-"""A quadrotor alone, or with a payload on a cable, driven by its logged commands and its measured
+"""A quadrotor with or without a payload on a cable, driven by its logged commands and its measured
 attitude.
 
-Where the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity
-alone, whatever controller flies; where each motor's command is logged, the rates follow too. No
-controller has to be known. The simulator's replay flies it, with the attitude from the log."""
+If the attitude is measured, the path of the centre of mass follows from thrust, drag and gravity
+with any controller; if each motor's command is logged, so do the rates. The controller need not be
+known. The simulator's replay flies the vehicle, with the attitude from the log."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -32,9 +32,9 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples, interpolate
 
-ROWS = 2  # of commands and attitudes a step
-SWINGING = 3  # steps a row where a payload swings below
-NEVER = 1e9  # after a start, when the cable is let go [s]
+ROWS = 2  # rows of commands and attitudes per step
+SWINGING = 3  # replay steps per row with a payload
+NEVER = 1e9  # time of release after a window's start, beyond its end [s]
 
 
 class FlyerModel(DrivenModel):
@@ -50,14 +50,14 @@ class FlyerModel(DrivenModel):
         drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         self.inputs = (params.attitude, params.input, *drivers)
         self.needed = (params.position, params.attitude, params.input, *simulated)
-        self.row = params.step / ROWS  # between commands of a flight [s]
-        # rows of attitudes before a window and behind it, for what may be late
+        self.row = params.step / ROWS  # time between rows [s]
+        # additional rows of attitudes before and after a window, for their delay
         self.spare = int(np.ceil(MOST_LATE / self.row)) + 1
         super().__init__(logs, params)
         self.rows = ROWS * self.steps
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
-        """See the base class; windows in which the vehicle flies."""
+        """See the base class; only windows in which the vehicle flies."""
         params = self.params
         driving = [params.position, params.attitude, params.input]
         if NEIGHBOUR in log:
@@ -83,9 +83,7 @@ class FlyerModel(DrivenModel):
         return stretches
 
     def without_windows(self, logs: Sequence[FlightLog]) -> str:
-        """Say how high logs fly and how much of the weight their thrust carries, beside what
-        windows need.
-        """
+        """Return the largest height and thrust of the logs, with those that windows need."""
         params = self.params
         heights = [np.max(log[params.position].samples().values[:, 2]) for log in logs]
         weight = params.gravity * params.total_mass
@@ -129,14 +127,14 @@ class FlyerModel(DrivenModel):
         return listed
 
     def without_commands(self, theta: Sizes, windows: Sequence[int]) -> list[ndarray]:
-        """See the base class; commands that an autopilot logs of its own motors all came."""
+        """See the base class; motors' commands that an autopilot logs itself are never lost."""
         if self.params.input != "command":
             return []
         return [self._change_without_each(self.size(theta), i) for i in windows]
 
     def _change_without_each(self, size: ndarray, i: int) -> ndarray:
-        """Return the change of a window's samples by each command that does not come, shape
-        (N, T).
+        """Return the change of a window's samples if each acting command is lost in turn, shape
+        (N, commands).
         """
         stretch = self.stretches[i]
         inputs = without_each(stretch.data["sent"], self.params, stretch.data["start"])
@@ -152,16 +150,16 @@ class FlyerModel(DrivenModel):
     def _fly(self, lanes: Lanes, keep: bool = False) -> Any:
         """Replay lanes (``sim.kernels.replay.lanes.Replayed``).
 
-        ``keep``: whether the quantities at the knots of each are wanted."""
+        ``keep``: whether to return the quantities at each lane's knots."""
         driven = np.column_stack([lanes.owner, lanes.theta])
         _, first, window = np.unique(driven, axis=0, return_index=True, return_inverse=True)
-        flights = lanes.part(first)  # one for all that begin or are pushed otherwise
+        flights = lanes.part(first)  # lanes that differ in initial state or force share a flight
         tables = self._commands(flights) | self._attitudes(flights)
         begun = {name: table[window, 0] for name, table in tables.items()}
         sizes, plant = np.unique(lanes.theta, axis=0, return_inverse=True)
         replay = replay_of(self.params, self.laws, dict(zip(self.numbers, sizes.T)))
         count = len(lanes.owner)
-        push = np.argmax(np.abs(lanes.latent), axis=1)  # one acts in a lane at most
+        push = np.argmax(np.abs(lanes.latent), axis=1)  # at most one acts in a lane
         size = lanes.latent[np.arange(count), push]
         block, axis = np.array(self.pushes)[push // self.knot_count].T
         none = np.full(count, -1)
@@ -187,14 +185,14 @@ class FlyerModel(DrivenModel):
         )
 
     def _commands(self, lanes: Lanes) -> dict[str, ndarray]:
-        """Return the time, each motor's thrust and the slope of their sum in each row of lanes'
-        flights, shape (B, rows, ...).
+        """Return the time [s], each motor's thrust [N] and the slope of their sum [N/s] in each row
+        of the lanes, shape (B, rows, ...).
         """
         thrusts = self.thrusts(lanes, self.rows)
         ends = thrusts[::2]
         means = (ends[:-1] + 4.0 * thrusts[1::2] + ends[1:]) / 6.0
         each = np.broadcast_to(means, (*means.shape[:2], 4)) * (means.shape[2] / 4.0)
-        # the whole thrust's slope between knots, as they show it
+        # slope of the total thrust, interpolated between the knots
         knots = np.linspace(0.0, self.params.window, self.knot_count)
         rows = self.row * np.arange(self.rows)
         at_knots = triangles(knots, self.row * np.arange(self.rows + 1)) @ ends.sum(2)
@@ -203,8 +201,8 @@ class FlyerModel(DrivenModel):
         return {"command_time": time, "command": each.swapaxes(0, 1), "thrust_rate": slope.T}
 
     def _attitudes(self, lanes: Lanes) -> dict[str, ndarray]:
-        """Return the attitudes that lanes take, and how they turn, in each row of their flights,
-        shape (B, rows, ...): measured ones without what is wrong with them.
+        """Return the imposed attitudes, their rates and angular accelerations in each row, shape
+        (B, rows, ...): the measured ones, corrected by the lanes' effects.
         """
         late = self.spare + self.size_of(lanes, "attitude_delay") / self.row
         measured = self.of_windows(lanes, "turned")
@@ -219,28 +217,28 @@ class FlyerModel(DrivenModel):
         quat = _product(level, _product(quat, quat_of_vector(turn)))
         turned = vectors_between(quat[:, :-1].reshape(-1, 4), quat[:, 1:].reshape(-1, 4))
         acc = np.diff(rate, axis=1) / self.row
-        if self.params.torque is not None:  # which turns the vehicle
+        if self.params.torque is not None:  # torques turn the vehicle
             acc = 0.0 * acc
         neighbour = np.zeros_like(acc)
         if NEIGHBOUR in self.inputs:
             neighbour = rotate(level, self.of_windows(lanes, NEIGHBOUR)[:, : self.rows])
         return {
             "attitude": quat[:, :-1],
-            "rate_b": rate[:, :-1],  # where no torque is simulated
+            "rate_b": rate[:, :-1],  # used if no torque is simulated
             "turn_b": turned.reshape(acc.shape) / self.row,
             "turn_acc_b": acc,
             "neighbour_pos_w": neighbour,
         }
 
     def _level(self, lanes: Lanes) -> ndarray:
-        """Return the attitude of the measured frame in the world, shape (B, 4)."""
+        """Return the attitude of the measured frame in the world, a quaternion, shape (B, 4)."""
         return quat_of_vector(self.stack(lanes, "frame_tilt_x", "frame_tilt_y", ""))
 
     def _recording(self, flights: Lanes, tables: Mapping[str, ndarray]) -> Any:
-        """Return the windows that a replay flies, and the stamps of what each sensor shows of them
+        """Return the windows to replay, and the stamps of each sensor's samples in them
         (``sim.kernels.replay.lanes.Recording``).
 
-        ``tables``: what drives each flight, shape (B, rows, ...).
+        ``tables``: commands and attitudes of each flight, shape (B, rows, ...).
         """
         from sim.kernels.replay.kernel import ATTACHED, NO_PAYLOAD
         from sim.kernels.replay.lanes import Recording
@@ -274,9 +272,9 @@ class FlyerModel(DrivenModel):
         return Recording(windows, data)
 
     def _begin(self, lanes: Lanes, begun: Mapping[str, ndarray]) -> dict[str, ndarray]:
-        """Return initial states of a replay from the unknowns at the windows' start.
+        """Return the initial states of a replay from the lanes' initial states.
 
-        ``begun``: what drives each lane there."""
+        ``begun``: commands and attitude of each lane at its start."""
         from sim.kernels.replay.lanes import still
 
         p = self.params

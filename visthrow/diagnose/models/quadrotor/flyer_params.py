@@ -1,5 +1,5 @@
-"""Parameters of a quadrotor that its logged commands drive, and of one whose attitude is measured:
-the table ``flyer`` of a setup.
+"""Parameters of a quadrotor driven by its logged commands, and of one whose position and attitude
+are measured: the table ``flyer`` of a setup.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from numpy import ndarray
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 
-MOST_LATE = 0.15  # by which attitudes may be late or early [s]
+MOST_LATE = 0.15  # largest delay of attitudes, late or early [s]
 MOTORS = ("fl", "fr", "rl", "rr")
 
 
 @dataclass(frozen=True)
 class CableParams(Bounded):
-    """Payload on a cable without mass: a rod, which also pushes."""
+    """Payload on a massless cable, modelled as a rod, which can also push."""
 
     length: Positive  # to the payload's centre [m]
     mass: Positive  # of the payload [kg]
@@ -27,17 +27,17 @@ class CableParams(Bounded):
 
 @dataclass(frozen=True)
 class TorqueParams(Bounded):
-    """A map from commands of single motors to rates."""
+    """Inertia and rotor geometry, which determine body rates from the motors' thrusts."""
 
     inertia: tuple[Positive, Positive, Positive]  # [kg m^2]
-    arm_x: Positive  # of each rotor from the centre of mass, along x and along y [m]
-    arm_y: Positive
+    arm_x: Positive  # distance of each rotor from the centre of mass along x [m]
+    arm_y: Positive  # along y [m]
     torque_ratio: NotNegative  # drag torque over thrust [m]
-    # +1 turns clockwise seen from above; order of the rotors as everywhere
+    # +1 turns clockwise seen from above; front left, front right, rear left, rear right
     spin: tuple[float, float, float, float]
 
     def of(self, thrusts: ndarray) -> ndarray:
-        """Return the torque of four rotors' thrusts, shape (..., 4), about the middle of them
+        """Return the torque of four rotors' thrusts [N], shape (..., 4), about the rotors' centre
         [N m], shape (..., 3).
         """
         front_left, front_right, rear_left, rear_right = np.moveaxis(thrusts, -1, 0)
@@ -49,28 +49,29 @@ class TorqueParams(Bounded):
 
 @dataclass(frozen=True)
 class QuadrotorParams(Bounded):
-    """The vehicle that is assumed first.
+    """The vehicle before any effect is found.
 
-    Raises ConfigError where the map does not rise.
+    Raises ConfigError: the thrust map does not rise.
     """
 
     input: str  # channel of the commands
-    mass: Positive  # of the vehicle alone [kg]
+    mass: Positive  # of the vehicle without payload [kg]
     gravity: Positive  # [m/s^2]
-    # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
+    # coefficients of powers 0, 1, 2 of the input in a motor's thrust [N]; in the thrust of all
+    # motors for a thrust command
     thrust_map: tuple[float, float, float]
     motor_time_constant: NotNegative  # [s]
-    command_delay: float  # below 0 where the log stamps its inputs late [s]
-    reference_voltage: Positive  # at which the map holds [V]
-    voltage_coefficient: float  # thrust changes by this share a volt [1/V]
-    window: Positive  # [s]
+    command_delay: float  # negative if the log stamps its inputs late [s]
+    reference_voltage: Positive  # for which the map is valid [V]
+    voltage_coefficient: float  # relative change of thrust per volt [1/V]
+    window: Positive  # length of a window [s]
     step: Positive  # of the integration [s]
-    every: int  # the measured samples taken: every n-th
-    most_windows: int  # spread evenly over all logs
+    every: int  # use every n-th measured sample
+    most_windows: int  # largest number of windows, spread evenly over all logs
 
     @property
     def total_mass(self) -> float:
-        """Return the mass of all that flies [kg]."""
+        """Return the flying mass [kg]."""
         return self.mass
 
     def thrust(self, inputs: ndarray) -> ndarray:
@@ -80,15 +81,18 @@ class QuadrotorParams(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
-            raise ConfigError(f"thrust_map {self.thrust_map} does not rise")
+            raise ConfigError(
+                f"thrust_map {self.thrust_map} does not rise; expected the second or third number"
+                " above 0"
+            )
 
 
 @dataclass(frozen=True)
 class FlyerParams(QuadrotorParams):
     """A vehicle whose position and attitude are measured.
 
-    Raises ConfigError where torque has no motors' commands or a mounted cable, or where the
-    map does not rise.
+    Raises ConfigError: ``torque`` without commands of single motors or with ``cable.mount``, or a
+    thrust map that does not rise.
     """
 
     # channel of the commands
@@ -99,8 +103,8 @@ class FlyerParams(QuadrotorParams):
     attitude: str  # channel of the measured attitude
     drag_xy: NotNegative  # rotor drag [kg/s]
     drag_z: NotNegative  # [kg/s]
-    lowest: float  # windows keep above this height [m]
-    # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
+    lowest: float  # smallest height in a window [m]
+    # rate at which the attitude estimate mistakes forces other than thrust for tilt [1/s]
     estimator_rate: Positive = 1.0
     torque: TorqueParams | None = None  # None: rates are not simulated
     cable: CableParams | None = None  # None: no payload
@@ -112,17 +116,17 @@ class FlyerParams(QuadrotorParams):
 
     @property
     def relative_mass(self) -> float:
-        """Return the vehicle's mass in 0.21 kg, the mass that the catalogue's forces refer to."""
+        """Return the vehicle's mass relative to 0.21 kg, for which the catalogue states forces."""
         return self.mass / 0.21
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
             raise ConfigError(
-                f"torque needs commands of single motors; the input is '{self.input}'"
+                f"torque with the input '{self.input}'; expected motor_command or motor_speed"
             )
         if self.torque is not None and self.cable is not None and any(self.cable.mount):
             raise ConfigError(
-                f"cable.mount {self.cable.mount} beside torque: the model has no torque of a cable;"
-                " expected one of them alone"
+                f"cable.mount {self.cable.mount} with torque: the model has no torque of a cable;"
+                " expected only one of them"
             )

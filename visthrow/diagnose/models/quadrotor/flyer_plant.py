@@ -1,4 +1,4 @@
-"""The simulator's plant of a setup's quadrotor, with effects of any size.
+"""The simulator's plant of a setup's quadrotor, with effects of given sizes.
 
 A cable is a massless rod on joints: it pulls, and pushes where a cable would be slack."""
 
@@ -16,22 +16,22 @@ from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.task import load_experiment, plant_of
 
-ARM = 1e-3  # of rotors whose torques are not simulated [m]
-# radius of gyration where the measured attitude alone turns the vehicle [m]
+ARM = 1e-3  # lever arm of rotors whose torques are not simulated [m]
+# radius of gyration of a vehicle with imposed attitude [m], so large that torques do not turn it
 UNTURNED = 100.0
-ALMOST_NONE = 1e-9  # in place of 0, where the simulator needs a positive number
-AMPLE_LIFT = 1e3  # weights that motors lift: no thrust is limited
-NO_CABLE = CableParams(1.0, 1.0)  # of a vehicle whose windows have no payload
+ALMOST_NONE = 1e-9  # instead of 0, where the simulator needs a positive number
+AMPLE_LIFT = 1e3  # largest thrust in weights, which is never reached
+NO_CABLE = CableParams(1.0, 1.0)  # placeholder for a vehicle without payload
 
 
 @cache
 def _neutral_plant() -> PlantParams:
-    """Return a plant for the numbers that do nothing where thrusts and attitudes are given."""
+    """Return a plant for the parameters without effect when thrusts and attitudes are imposed."""
     return plant_of(load_experiment("state"))
 
 
 def plant_for(params: FlyerParams, laws: tuple[LawParams, ...]) -> PlantParams:
-    """Return the plant of a setup as it stands, whose commands are the motors' thrusts at once."""
+    """Return the plant of a setup without effects; its commands are the motors' current thrusts."""
     base = _neutral_plant()
     torque = params.torque or TorqueParams(
         (params.mass * UNTURNED**2,) * 3, ARM, ARM, ALMOST_NONE, (1.0, -1.0, -1.0, 1.0)
@@ -79,7 +79,7 @@ def plant_for(params: FlyerParams, laws: tuple[LawParams, ...]) -> PlantParams:
 def _replay(params: FlyerParams, laws: tuple[LawParams, ...]) -> Any:
     """Return the replay of a setup's vehicle (``sim.kernels.replay.lanes.Replay``).
 
-    Raises LogError: the simulator flies no such vehicle or laws."""
+    Raises LogError: the simulator refuses the vehicle or the laws."""
     from sim.kernels.replay.lanes import Replay
 
     try:
@@ -92,10 +92,9 @@ def _replay(params: FlyerParams, laws: tuple[LawParams, ...]) -> Any:
 def replay_of(
     params: FlyerParams, laws: tuple[LawParams, ...], sizes: Mapping[str, ndarray]
 ) -> Any:
-    """Return the replay of a setup's vehicle with effects of several sizes, a row of its plants
-    each.
+    """Return the replay of a setup's vehicle with one plant for each row of effect sizes.
 
-    ``sizes``: of all effects, shape (rows,).
+    ``sizes``: effect -> sizes, shape (rows,), for all effects of the model.
     """
     replay = _replay(params, laws)
     count = len(sizes["mass_quad"])
@@ -114,7 +113,7 @@ def replay_of(
 
 
 def _number(rows: Mapping[str, ndarray], path: str) -> ndarray:
-    """Return the number of a path in all rows of plants and sensors."""
+    """Return the parameter at a dotted path in all rows of plants and sensors."""
     group, *names = path.split(".")
     number = rows[group]
     for name in names:

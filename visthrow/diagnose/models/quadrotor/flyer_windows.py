@@ -1,6 +1,4 @@
-"""Cuts logs of a quadrotor into windows: measurements, inputs on a grid, first guesses of the
-state.
-"""
+"""Windows of a quadrotor's logs: measurements, inputs, and first guesses of the initial state."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -16,23 +14,24 @@ from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams, Quadrot
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.samples import Samples
 
-# noise below which none is believed; of other channels 1e-4
+# smallest noise assumed of a channel; 1e-4 for the others
 LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
 Table = tuple[ndarray, ndarray, ndarray]
 """Stamps [s], shape (n,), values, shape (n, C), and their noise, shape (C,)."""
-NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
-_GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
+NEIGHBOUR = "neighbour_pos_w"  # measured position of a body that may push the vehicle
+_GUESS = 0.25  # first guesses are from straight lines through this much of a window [s]
 MOST_MISSING = 0.25  # largest gap in an input within a window [s]
-# median thrust over the weight, by the map: a map may be far off, a unit is off by more
+# largest ratio of the map's median thrust to the weight: a wrong map may reach it, a wrong unit
+# exceeds it
 _MOST_THRUST = 5.0
-_MEMORY = 10.0  # of a filter, in its time constants
-IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
+_MEMORY = 10.0  # past that a filter remembers, in its time constants
+IDLE = 0.3  # thrust over weight below which the vehicle is on the ground
 
 
 def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None:
-    """Refuse commands of another unit: they carry neither the vehicle nor anything like it.
+    """Refuse commands in a wrong unit, whose thrust is far above the weight.
 
-    Raises LogError: they are.
+    Raises LogError: the median thrust exceeds ``_MOST_THRUST`` weights.
     """
     weight = params.gravity * params.total_mass
     inputs = np.concatenate([s.data["sent"].values for s in stretches])
@@ -40,15 +39,16 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
     if ratio > _MOST_THRUST:
         raise LogError(
             f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the"
-            f" weight of {weight:.3g} N: another unit, or another vehicle's map"
+            f" weight of {weight:.3g} N: another unit, or another vehicle's map; expected at most"
+            f" {_MOST_THRUST:g} times"
         )
 
 
 def cut_flying(
     log: FlightLog, params: QuadrotorParams, channels: Sequence[str], driving: Sequence[str]
 ) -> Iterator[tuple[float, list[Table], dict[str, Any]]]:
-    """Yield start [s], samples of ``channels``, and what the motors need, of each window in which
-    the vehicle flies and no channel of ``driving`` has a large gap.
+    """Yield each window in which the vehicle flies and no channel of ``driving`` has a large gap:
+    its start [s], samples of ``channels``, and the motors' inputs.
     """
     sigma = {name: sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels}
     driven = [log[name] for name in driving]
@@ -58,7 +58,7 @@ def cut_flying(
     first = max(c.time[0] for c in driven)
     last = min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
-    # hours are thinned before they are cut
+    # of long logs, only every stride-th window is cut
     stride = max(1, len(starts) // (4 * params.most_windows))
     for start in starts[::stride]:
         if not all(covered(c, start, start + params.window) for c in driven):
@@ -77,7 +77,7 @@ def cut_flying(
 
 
 def covered(channel: Channel, start: float, end: float) -> bool:
-    """Whether a channel has no large gap between two times."""
+    """Return whether a channel has no large gap between two times."""
     during = (channel.time >= start) & (channel.time <= end)
     stamps = channel.time[channel.valid & during]
     gaps = np.diff([start, *stamps, end])
@@ -85,13 +85,15 @@ def covered(channel: Channel, start: float, end: float) -> bool:
 
 
 def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
-    """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
+    """Return whether the thrust of a window's inputs is always above that of a vehicle on the
+    ground.
+    """
     thrust = params.thrust(inputs).sum(axis=1)
     return np.min(thrust) >= IDLE * params.mass * params.gravity
 
 
 def cut_commands(commands: Samples, first: float, last: float) -> Samples:
-    """Return the commands that are held between two times, at least the first or the last."""
+    """Return the commands that are held between two times; at least one, the nearest."""
     time, values = commands
     begin = max(np.searchsorted(time, first, "right") - 1, 0)
     end = max(np.searchsorted(time, last), begin + 1)
@@ -101,11 +103,11 @@ def cut_commands(commands: Samples, first: float, last: float) -> Samples:
 def lagged(
     time: ndarray, commanded: ndarray, instants: ndarray, lag: float
 ) -> tuple[ndarray, ndarray]:
-    """Return what follows held commands by a lag, at some instants, and its integral up to a
-    constant, each of shape (T, N).
+    """Return the response of a first-order lag to held commands, and its integral up to a constant,
+    each of shape (T, N).
 
-    ``time``: of the commands [s], shape (C,), the first held before; ``commanded``: shape (C, N);
-    ``instants``: [s], shape (T, 1).
+    ``time``: of the commands [s], shape (C,); before it, the first is held; ``commanded``: shape
+    (C, N); ``instants``: of the response [s], shape (T, 1); ``lag``: time constant [s].
     """
     changes = np.diff(commanded, axis=0)
     age = np.maximum(instants - time[1:], 0.0)
@@ -115,9 +117,10 @@ def lagged(
 
 
 def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end: float) -> ndarray:
-    """Return the numbers of the commands that act between two times and differ from the one before.
+    """Return the indices of the commands that act between two times and differ from the one before.
 
-    ``time``: of the commands, shape (C,); ``values``: shape (C, N); ``delay``: to their acting."""
+    ``time``: of the commands [s], shape (C,); ``values``: shape (C, N); ``delay``: before they act
+    [s]."""
     acts = time + delay
     replaced = np.append(acts[1:], np.inf)
     during = (replaced > start) & (acts < end)
@@ -126,7 +129,9 @@ def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end:
 
 
 def without_each(commands: Samples, params: FlyerParams, start: float) -> list[Samples]:
-    """Return a window's commands without each that acts in it: the one before stays."""
+    """Return copies of the commands, each without one that acts in the window; the command before
+    it is held instead.
+    """
     time, values = commands
     inputs = []
     for k in find_acting(time, values, params.command_delay, start, start + params.window):
@@ -137,13 +142,13 @@ def without_each(commands: Samples, params: FlyerParams, start: float) -> list[S
 
 
 def lean_of(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
-    """Turn from a leaning estimate of the attitude to the true one, shape (T, 3); 0 where
-    nothing tells it.
+    """Return the rotation vector from the estimated attitude to the true one, shape (T, 3); 0
+    without an accelerometer.
 
-    In flight the accelerometer tells thrust alone; a filter that knows it as thrust alone takes
-    what pushes level with the rotors for tilt, at ``rate``. A gyro's offset tilts it as well: the
-    tilt stays at which the correction, the gyro less the estimate's own rate, holds it up. Of the
-    force the flight's middle is taken off: a mount that is not level makes a constant.
+    An attitude filter that assumes a force along the rotors' axis only mistakes forces in the rotor
+    plane for tilt, at ``rate`` [1/s]. A gyro's offset tilts the estimate too, until the correction,
+    which is the gyro minus the estimate's rate, balances the offset. The flight's median is
+    subtracted from the force, because a tilted sensor causes a constant.
 
     Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only
     acceleration in z)."""
@@ -167,7 +172,7 @@ def lean_of(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarr
 
 
 def _line(table: Table, start: float) -> ndarray:
-    """Return value and slope at the start of a straight line through what follows."""
+    """Return value and slope at the start of a straight line through the samples after it."""
     time, values, _ = table
     early = time <= max(start + _GUESS, time[min(3, len(time) - 1)])
     return np.polynomial.polynomial.polyfit(time[early] - start, values[early], 1)
@@ -176,7 +181,8 @@ def _line(table: Table, start: float) -> ndarray:
 def guess_start(
     tables: Mapping[str, Table], params: FlyerParams, quat: ndarray, rate: ndarray
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """Unknowns at the start, their spread, and the cable's direction there.
+    """Return a first guess of the initial state, its standard deviations, and the cable's direction
+    there.
 
     ``tables``: samples of each channel; ``quat, rate``: attitude and body rate at the start.
     """

@@ -1,8 +1,8 @@
-"""A quadrotor whose position nobody measures: driven by its motors' logged commands, seen by its
+"""A quadrotor without measured position: driven by its motors' logged commands, and measured by its
 accelerometer and gyro.
 
-Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
-of torque to inertia. An accelerometer's offset hides the map's scale."""
+Force along the rotors' axis and body rates determine the motors' lag, the shape of the thrust map
+and ratios of torque to inertia. The accelerometer's offset hides the scale of the map."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,24 +21,24 @@ from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples, interpolate
 
 CHANNELS = ("acc_b", "rate_b")
-COLUMNS = slice(3, 4), slice(0, 3)  # of the state that these channels show
+COLUMNS = slice(3, 4), slice(0, 3)  # columns of the state that CHANNELS measure
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
-OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
-# correlation of angular acceleration with the commands' torques, which determines inertia: 0.99
-# in simulated flights, 0.2 to 0.5 in fast flights of a Crazyflie, which the air turns as well
+OFFSET = 0.5  # prior standard deviation of an accelerometer's offset in flight [m/s^2]
+# smallest correlation of angular acceleration with the commands' torques that determines inertia:
+# 0.99 in simulated flights, 0.2 to 0.5 in fast flights of a Crazyflie, which air also turns
 FOLLOWS = 0.8
-SMOOTHING = 0.05  # of the gyro for its slope [s]
+SMOOTHING = 0.05  # span over which the gyro is differentiated [s]
 
 
 @dataclass(frozen=True)
 class ImuParams(QuadrotorParams):
-    """A vehicle whose position nobody measures.
+    """A vehicle without measured position.
 
-    Raises ConfigError where the map does not rise.
+    Raises ConfigError: the thrust map does not rise.
     """
 
     input: Literal["motor_command", "motor_speed"]  # channel of the commands
-    # how thrusts turn the vehicle; None: rates are not simulated, and the gyro is not read
+    # None: rates are not simulated, and the gyro is not used
     torque: TorqueParams | None = None
 
 
@@ -46,13 +46,13 @@ class ImuModel(DrivenModel):
     """Windows of flights of one vehicle."""
 
     table = "imu"
-    anchored = True  # an accelerometer is off by little, which a wrong map is not
+    anchored = True  # an accelerometer's offset is small, the error of a wrong map is not
     channels = CHANNELS
-    lawless = "nothing tells the attitude and the velocity that a law is made of"
+    lawless = "a law needs the attitude and the velocity, which are not measured"
 
     def __init__(self, logs: Sequence[FlightLog], params: ImuParams):
-        """See the base class; the gyro is left out where the setup states no torques, or where the
-        motors do not tell what turns the vehicle.
+        """See the base class; the gyro is not used if the setup states no torques, or if the rates
+        do not follow the motors' torques.
         """
         if params.torque is None:
             self.channels = CHANNELS[:1]
@@ -78,8 +78,8 @@ class ImuModel(DrivenModel):
         return stretches
 
     def simulate(self, lanes: Lanes) -> ndarray:
-        """See the base class; the state: body rates, and behind them the force along the rotors'
-        axis over the mass [m/s^2], with the accelerometer's offset.
+        """See the base class; the state is the body rates [rad/s], followed by the specific force
+        along the rotors' axis [m/s^2], with the accelerometer's offset.
         """
         thrust = self.thrusts(lanes, self.steps)
         pushes = self.pushes_at(lanes, halves(self.steps))
@@ -87,7 +87,7 @@ class ImuModel(DrivenModel):
         if "rate_b" in self.channels:
             rates = self._turn(lanes, thrust, pushes[:, :, -3:])
         gust = pushes[:, :, 2]
-        gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
+        gust = gust - gust.mean(0)  # a constant part belongs to the offset or to the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
         acc = push + lanes.nuisance[:, 3:]
         return np.concatenate([rates, acc[..., None]], 2)
@@ -121,8 +121,8 @@ class ImuModel(DrivenModel):
 
 
 def _relate_turning(log: FlightLog, params: ImuParams) -> Relation | None:
-    """Relate the angular acceleration to what the commands' torques would give; None where a
-    channel lacks, nothing turns, or the setup states no torques.
+    """Relate the angular acceleration to that by the commands' torques; None if a channel is
+    missing, nothing turns, or the setup states no torques.
     """
     if params.torque is None or params.input not in log or "rate_b" not in log:
         return None
@@ -132,12 +132,11 @@ def _relate_turning(log: FlightLog, params: ImuParams) -> Relation | None:
 
 
 def _why_not(turned: Sequence[Relation], source: str) -> str:
-    """Return why a model leaves the rates out."""
+    """Return the reason why a model does not use the rates."""
     worst = min(turned, key=lambda r: r.correlation)
     reason = (
         f"the rates follow the torques of {source} with a correlation of {worst.correlation:.2f}"
-        f" only (expected {FOLLOWS} or more): the air turns this vehicle as well, or hardly"
-        " anything does"
+        f" only (expected {FOLLOWS} or more): air also turns this vehicle, or it hardly turns"
     )
     if worst.nats > 0.0:
         reason += f"; as ({worst.axes}) it is {worst.axes_correlation:.2f}: motors in another order"
