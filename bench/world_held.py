@@ -11,7 +11,7 @@ import warp as wp
 
 from sim import solvers
 from sim.solvers import World
-from sim.solvers.chain_engine import ChainSolver
+from sim.solvers.exchanged_chain import ChainSolver
 
 
 class WorldHeldChain(ChainSolver):

@@ -15,7 +15,6 @@ from hil.control.recording.record import TICKS, lines, load_setup, require_run
 from hil.control.state_machine import OperatorInput, State
 from hil.control.tick.runner import Runner
 from hil.errors import RunError
-from hil.fly_run import key_of, params_of
 from hil.links.backends import make_backend
 from hil.links.backends.base import FOLLOW, DryRun, Status
 from hil.links.backends.thrust_curve import LEAST_SHARES, HoverMeter
@@ -26,6 +25,7 @@ from hil.poses import handcarry
 from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
 from hil.poses.sources.open_source import open_source, unit_problems
+from hil.run_command import key_of, params_of
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.policy import Policy, find_policy
 

@@ -11,7 +11,7 @@ TABLES = tables_beside(__file__, "commands.toml")
 
 FLIES = ("run", "record", "calibrate")
 
-FUNCTIONS = dict.fromkeys(FLIES, "hil.fly_run:fly") | {
+FUNCTIONS = dict.fromkeys(FLIES, "hil.run_command:fly") | {
     "check": "hil.check:check",
     "replay": "hil.control.recording.playback:compare_run",
     "view": "hil.control.recording.view:run",

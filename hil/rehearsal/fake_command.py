@@ -11,7 +11,6 @@ import numpy as np
 
 from hil.commands import examples
 from hil.errors import RunError
-from hil.fly_run import key_of
 from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
@@ -23,6 +22,7 @@ from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, serve
+from hil.run_command import key_of
 from visthrow import config
 from visthrow.common.arguments import declare
 from visthrow.common.errors import suggest

@@ -19,7 +19,7 @@ from sim.kernels.structs import Types
 from sim.params import PlantParams, RopeParams, VehicleParams
 
 SOLVERS = {
-    "exchanged_chain": "sim.solvers.chain_engine:ChainSolver",
+    "exchanged_chain": "sim.solvers.exchanged_chain:ChainSolver",
     "physx": "sim.solvers.physx:PhysxSolver",
     "mujoco_warp": "sim.solvers.mujoco:MujocoSolver",
 }

@@ -23,7 +23,7 @@ from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.task import plant_of, rewards, terminations
-from visthrow.training.env.throw_episodes import ThrowEpisodes
+from visthrow.training.env.env_base import ThrowEpisodes
 
 
 class TeamEnv(ThrowEpisodes):

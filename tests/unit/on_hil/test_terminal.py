@@ -11,8 +11,8 @@ from pytest import fixture, mark, raises
 
 from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
-from hil.fly_run import require_fake
 from hil.operator_terminal import ENDING, PAUSING, Console, Terminal
+from hil.run_command import require_fake
 from tests.configs import load_run
 
 

@@ -20,8 +20,8 @@ from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, draw_plants, plant_of, rewards, terminations
 from visthrow.task.fleet import Member, members
+from visthrow.training.env.env_base import ThrowEpisodes
 from visthrow.training.env.options import FleetSetup, MovingGoals, PoseDelay
-from visthrow.training.env.throw_episodes import ThrowEpisodes
 
 
 class ThrowEnv(ThrowEpisodes):
