@@ -1,4 +1,4 @@
-"""Readers of log files, a kind a module: tables, autopilots, blackbox, and what other tools write.
+"""Readers of log files, one module for each format: tables, autopilots, blackbox, recordings.
 
-`visthrow.logs` opens a file by its ending with one of them: a new reader is a module here, an
-ending and a branch of ``read`` there."""
+`visthrow.logs` selects the reader by the file's extension. A new reader needs a module here, and an
+extension and a branch of ``read`` there."""

@@ -1,9 +1,7 @@
-"""Logs of autopilots as flight logs:
+"""Conversion of autopilot logs (ULog, DataFlash, MAVLink telemetry) to flight logs.
 
-PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog).
-
-All of them are north-east-down and forward-right-down; ours become x north, y west, z up and
-forward, left, up."""
+Their world axes are north, east, down, and their body axes forward, right, down. The flight log's
+are north, west, up, and forward, left, up."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -40,8 +38,8 @@ BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
 
 @dataclass(frozen=True)
 class Tap:
-    """Fields of one kind of message that make a channel; a row of ``autopilot_fields.toml``, which
-    describes it.
+    """Fields of a message that make a channel: a row of ``autopilot_fields.toml``, where the
+    attributes are explained.
     """
 
     message: str
@@ -58,7 +56,9 @@ class Tap:
     only: tuple[str, float, float] | None = None
 
     def entry(self, vehicle: Vehicle) -> ChannelMap:
-        """Map its columns, those of motors by where they sit in a vehicle."""
+        """Return the mapping of the fields; those of motors in the order of the vehicle's
+        motors.
+        """
         columns = tuple(self.columns.split())
         if self.motors:
             columns = tuple(self.motors.replace("*", str(n)) for n in vehicle.motors)
@@ -80,7 +80,7 @@ class Tap:
 
 @cache
 def fields_of_autopilots() -> dict[str, Any]:
-    """Return the tables of `autopilot_fields.toml`, the taps of each kind of log as such."""
+    """Return the tables of `autopilot_fields.toml`, with rows of taps as :class:`Tap`."""
     tables = tables_beside(__file__, "autopilot_fields.toml")
     for taps in (tables["taps"], tables["pose_taps"]):
         taps |= {kind: tuple(Tap(**row) for row in rows) for kind, rows in taps.items()}
@@ -88,7 +88,7 @@ def fields_of_autopilots() -> dict[str, Any]:
 
 
 MOTORS_ALONE = ("actuator_motors", "esc_status", "ESC")
-"""Messages of motors that hold no other outputs, such as those of a gimbal."""
+"""Messages of motors only, without other outputs such as a gimbal's."""
 RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "z", "vxy", "vz")) + (
     "reset_counter",
     "Rst",
@@ -98,8 +98,8 @@ RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "z", "vxy", "vz")) + (
 
 SWEEP = ("SIDS", "SIDD")
 SWEEP_AXES = 7
-"""Messages of ArduPilot's SYSTEMID: its settings, and the sweep [deg/s]; its axes from which on it
-sweeps rates of roll, pitch, yaw.
+"""Messages of ArduPilot's SYSTEMID: settings and sweep [deg/s]; and number of the first of its axes
+that sweep the rates of roll, pitch and yaw.
 """
 
 READERS = {
@@ -108,11 +108,11 @@ READERS = {
     ".tlog": (read_telemetry, "telemetry"),
     ".csv": (read_converted, "ulog"),
 }
-"""Ending -> reader of the messages, and the kind of log."""
+"""Extension -> reader of the messages, and the kind of log."""
 
 
 def choose_converted_tables(files: Iterable[Path]) -> list[Path]:
-    """Return one table of each PX4 log among tables, which ``ulog2csv`` wrote."""
+    """Return one table of each PX4 log that ``ulog2csv`` converted, among some files."""
     topics = {tap.message for tap in fields_of_autopilots()["taps"]["ulog"]}
     logs: dict[str, Path] = {}
     for file in files:
@@ -123,9 +123,9 @@ def choose_converted_tables(files: Iterable[Path]) -> list[Path]:
 
 
 def log_of_autopilot(path: str | Path) -> FlightLog:
-    """Read the log of an autopilot, by its ending.
+    """Read the log of an autopilot as a flight log, by its extension.
 
-    Raises LogError: it cannot be read, or holds nothing of a vehicle's motion.
+    Raises LogError: it cannot be read, or has no message on the vehicle's motion.
     """
     reader, kind = READERS[Path(path).suffix.lower()]
     tables = fields_of_autopilots()
@@ -166,7 +166,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
 def _channel(
     tap: Tap, log: Messages, vehicle: Vehicle, source: str, left_out: list[str]
 ) -> tuple[Channel, dict] | None:
-    """Channel of a tap and notes on it; None where the log has none of its fields."""
+    """Return the channel of a tap and the notes on it; None if the log lacks its fields."""
     fields_of_motors = tap.motors or tap.outputs
     if fields_of_motors and not vehicle.motors:
         if log.first(tap.message) is not None:
@@ -195,7 +195,7 @@ def _channel(
 
 
 def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Channel, dict]:
-    """Read a channel of the fields of a tap, and notes on it."""
+    """Return the channel that a tap makes of the fields of a message, and the notes on it."""
     with np.errstate(invalid="ignore"):  # damaged floats
         values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
     if entry.name == "vel_w" and "velocity_frame" in fields:
@@ -204,15 +204,15 @@ def _read(tap: Tap, entry: ChannelMap, fields: Fields, source: str) -> tuple[Cha
 
 
 def log_of_poses(path: str | Path, kind: str, message: str, instance: int) -> FlightLog:
-    """Read the poses of one message of a log of kind "bin" or "ulg", whatever its ending.
+    """Read the poses of one message of a log of kind "bin" or "ulg", for any file extension.
 
-    The axes stay the autopilot's: world north, east, down (PX4 optionally forward, right, down),
-    body forward, right, down. The channels are pos_w, quat_wb (xyzw), vel_w, rate_b, as far as they
-    are known, ``arrival`` [s] and ``resets``. A position without an attitude goes with the
-    vehicle's own attitude and rates. ``together`` of the metadata names the channels that share
-    the position's stamps. Without such an instance no channel is there.
+    The axes are the autopilot's: world north, east, down (PX4 optionally forward, right, down),
+    body forward, right, down. The channels are pos_w, quat_wb (xyzw), vel_w and rate_b, if known,
+    ``arrival`` [s] and ``resets``. If the message has no attitude, the vehicle's estimated attitude
+    and rates are added. ``together`` of the metadata names the channels that share the position's
+    stamps. If the message has no such instance, the log is empty.
 
-    Raises LogError: it cannot be read, the message is not in it, or there is no attitude.
+    Raises LogError: the log cannot be read, lacks the message, or has no attitude.
     """
     taps = _pose_taps(kind)
     log = READERS[f".{kind}"][0](path, {tap.message for tap in taps} | {"ORGN"})
@@ -260,17 +260,17 @@ def _pose_taps(kind: str) -> list[Tap]:
 
 
 def _pose_part(tap: Tap) -> str:
-    """Return the part of a pose that a tap holds, whoever measured or estimated it."""
+    """Return the name of a tap's channel without the prefixes for measured and estimated poses."""
     return tap.channel.removeprefix("mocap_").removeprefix("est_")
 
 
 def _fits(tap: Tap, message: str, fields: Fields) -> bool:
-    """Return whether a tap is of a message with these fields."""
+    """Return whether a tap belongs to a message, and the message has all its fields."""
     return tap.message == message and all(column in fields for column in tap.columns.split())
 
 
 def _find_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
-    """Return where the vehicle's own attitude and rates stand."""
+    """Return the first taps of the vehicle's attitude and rates that the log holds, by channel."""
     sources: dict[str, tuple[Tap, Fields]] = {}
     for tap in taps:
         fields = log.first(tap.message)
@@ -281,8 +281,8 @@ def _find_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Field
 
 
 def _read_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
-    """Return a part of a pose about the autopilot's axes, without the samples that are not known;
-    a position keeps those that are not valid.
+    """Return a part of a pose in the autopilot's axes, without invalid samples; a position keeps
+    them.
     """
     entry = replace(tap.entry(Vehicle()), name=part, axes="", body_axes="")
     channel, _ = _read(tap, entry, fields, source)
@@ -290,15 +290,19 @@ def _read_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
 
 
 def _to_world(vel: ndarray, odometry: Fields) -> ndarray:
-    """Return velocities in the world frame; NaN for a body's without an attitude."""
+    """Return velocities in the world frame, shape (T, 3); NaN for velocities in the body frame
+    without a known attitude.
+    """
     quat = np.column_stack([odometry[f"q[{i}]"] for i in (1, 2, 3, 0)]).astype(float)
-    with np.errstate(invalid="ignore"):  # of attitudes that are not known
+    with np.errstate(invalid="ignore"):  # unknown attitudes are NaN
         vel_w = rotate(quat / np.linalg.norm(quat, axis=1, keepdims=True), vel)
     return np.where((odometry["velocity_frame"] == BODY_FRAME)[:, None], vel_w, vel)
 
 
 def _to_local(data: Fields, origins: Fields | None) -> Fields:
-    """Return north, east and down [m] from the estimator's origin, else from the first position."""
+    """Return north, east and down [m] relative to the estimator's origin, or to the first position
+    if the log has no origin.
+    """
     lat = data["Lat"][0]
     lng = data["Lng"][0]
     if origins is not None and "Type" in origins:
@@ -314,7 +318,9 @@ def _to_local(data: Fields, origins: Fields | None) -> Fields:
 
 
 def find_valid_rows(fields: Fields, flags: str) -> ndarray:
-    """Tell the rows that those of these flags that a message has call valid, bool, shape (T,)."""
+    """Return whether each row is valid by those of the flags that the message has, bool, shape
+    (T,).
+    """
     good = np.ones(len(fields["time"]), bool)
     ranges = fields_of_autopilots()["ranges"]
     for flag in flags.split():
@@ -324,7 +330,7 @@ def find_valid_rows(fields: Fields, flags: str) -> ndarray:
 
 
 def lies_within(values: ndarray, smallest: float, largest: float) -> ndarray:
-    """Tell the values within bounds, bool, shape (T,)."""
+    """Return whether each value is within bounds, bool, shape (T,)."""
     numbers = np.asarray(values, float)
     return (numbers >= smallest) & (numbers <= largest)
 
@@ -332,7 +338,9 @@ def lies_within(values: ndarray, smallest: float, largest: float) -> ndarray:
 def _choose_moving(
     instances: dict[int, Fields], columns: tuple[str, ...], tap: Tap
 ) -> tuple[int, Fields] | None:
-    """Return the first instance of a message with these columns that moves, else the first."""
+    """Return the first instance with these columns whose values change, else the first with these
+    columns; None if there is none. Rows are limited to those of ``tap.only``.
+    """
     candidates = []
     for number, fields in instances.items():
         if all(column in fields for column in columns):
@@ -351,7 +359,7 @@ def _choose_moving(
 
 
 def _list_untaken(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
-    """Yield messages of which every row is of a kind that no tap takes."""
+    """Yield a text for each message of which no row passes the ``only`` of any tap."""
     limited = [tap for tap in taps if tap.only is not None]
     for message in dict.fromkeys(tap.message for tap in limited):
         ranges = sorted({tuple(tap.only) for tap in limited if tap.message == message})
@@ -366,13 +374,17 @@ def _list_untaken(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
 
 
 def _count_moving_motors(fields: Fields, pattern: str) -> int:
-    """Count the motors of a message that move, named by a pattern such as ``control[*]``."""
+    """Count the motors of a message whose values change; ``pattern``: of their fields, such as
+    ``control[*]``.
+    """
     names = [pattern.replace("*", str(number)) for number in range(16)]
     return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
 
 
 def _join_escs(log: Messages) -> None:
-    """Speeds of ArduPilot's ESC messages, one an instance, on the stamps of the first, in place."""
+    """Merge ArduPilot's ESC messages, one instance per motor, into one with the stamps of the
+    first, in place.
+    """
     escs = {i: instance for i, instance in log.instances("ESC").items() if "RPM" in instance}
     if not escs:
         return
@@ -385,7 +397,9 @@ def _join_escs(log: Messages) -> None:
 
 
 def _find_flying(log: Messages) -> Channel | None:
-    """Whether the vehicle is armed and in the air; None where the log does not say."""
+    """Return the channel ``flying``, true if armed and in the air; None if the log has no such
+    message.
+    """
     signals = []
     for message, field, *bounds in fields_of_autopilots()["flying"][log.kind]:
         fields = log.first(message)
@@ -402,8 +416,8 @@ def _find_flying(log: Messages) -> Channel | None:
 
 
 def _add_sweep(channels: dict, notes: dict, log: Messages) -> None:
-    """Add a sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, which the log tells
-    without it.
+    """Add the sweep of ArduPilot's SYSTEMID to the commanded rate of its axis, in place, as the
+    logged rate does not include it.
     """
     started = log.first(SWEEP[0])
     sweep = log.first(SWEEP[1])

@@ -1,10 +1,9 @@
-"""Messages of autopilot logs as arrays:
+"""Messages of autopilot logs as arrays: PX4's ULog, ArduPilot's DataFlash (.BIN), MAVLink (.tlog).
 
-PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog). Onboard-safe.
-
-The one place that opens these files. Names, units and axes stay those of the autopilot;
-``visthrow.logs.readers.autopilot_logs`` makes flight logs of them, ``hil.poses.sources`` poses.
-Files are read as bytes: no device string, no condition, nothing is evaluated.
+Only this module opens these files. Names, units and axes are those of the autopilot;
+``visthrow.logs.readers.autopilot_logs`` turns messages into flight logs, ``hil.poses.sources`` into
+poses. Files are read as bytes: nothing in them is evaluated or used as a device or condition.
+Onboard-safe.
 
 Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tlog (big-endian
 microseconds before each message)."""
@@ -28,20 +27,16 @@ from visthrow.common.extras import load_extra
 from visthrow.logs.readers.recordings import add_numbers
 
 Fields = dict[str, np.ndarray]
-"""Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was
-written, both [s].
-"""
+"""Field -> values, shape (T,); ``time``: of the measurement [s], ``arrival``: of the record [s]."""
 
 FieldsByMessage = dict[tuple[str, int], Fields]
 """Name and instance of a message -> its fields."""
 
-# times that a reader may step back to one and the same byte; one that is led astray by a damaged
-# length does so for ever
+# How often a reader may step back to the same byte. A damaged length would make it do so forever.
 MOST_RETURNS = 8
 
-_HEAD = (  # of every DataFlash message; whatever begins otherwise would be searched byte by byte
-    b"\xa3\x95"
-)
+# Start of every DataFlash message. The parser would search any other file byte by byte.
+_HEAD = b"\xa3\x95"
 _INSTANCE = ("I", "C", "Instance")  # fields of DataFlash that number sensors and estimator cores
 _STDERR = 2
 
@@ -57,11 +52,11 @@ class Messages:
     parameters: dict[str, float] = field(default_factory=dict)  # of the autopilot
 
     def first(self, name: str) -> Fields | None:
-        """Return the message of the lowest instance; None where there is none."""
+        """Return the fields of a message's lowest instance; None if the log has no such message."""
         return next(iter(self.instances(name).values()), None)
 
     def instances(self, name: str) -> dict[int, Fields]:
-        """Return the message of each instance, the lowest first."""
+        """Return the fields of each instance of a message, the lowest first."""
         return {
             number: self.fields[key, number] for key, number in sorted(self.fields) if key == name
         }
@@ -73,7 +68,8 @@ class Messages:
 
 
 def read_ulog(path: str | Path, names: Collection[str]) -> Messages:
-    """Read topics of PX4's ``.ulg``; the time is ``timestamp_sample`` where it is known.
+    """Read topics of PX4's ``.ulg``; the time is ``timestamp_sample`` if the topic has it, else
+    ``timestamp``.
 
     Raises LogError: pyulog is not installed, or the file is no ULog.
     """
@@ -91,7 +87,7 @@ def read_ulog(path: str | Path, names: Collection[str]) -> Messages:
 
 
 def _add_times(data: Fields) -> Fields:
-    """Add when a topic of PX4 was measured and when it was written to its fields."""
+    """Add the times of measurement and of logging [s] to the fields of a PX4 topic."""
     arrival = data["timestamp"] * 1e-6
     sample = data.get("timestamp_sample")
     time = arrival if sample is None else np.where(sample > 0, sample * 1e-6, arrival)
@@ -99,10 +95,10 @@ def _add_times(data: Fields) -> Fields:
 
 
 def read_converted(path: str | Path, names: Collection[str]) -> Messages:
-    """Read topics of a PX4 log that ``ulog2csv`` wrote, a table each: ``LOG_TOPIC_INSTANCE.csv``.
-    It writes no parameters.
+    """Read topics of a PX4 log from the tables of ``ulog2csv``, ``LOG_TOPIC_INSTANCE.csv``, which
+    hold no parameters.
 
-    ``path``: of one of the tables. Raises LogError: one cannot be read, or lacks the stamps.
+    ``path``: of one of the tables. Raises LogError: a table cannot be read, or has no time stamps.
     """
     from visthrow.logs.readers.table_to_log import read_table
 
@@ -120,8 +116,8 @@ def read_converted(path: str | Path, names: Collection[str]) -> Messages:
 
 
 def name_converted(path: Path, names: Collection[str]) -> tuple[str, str, int]:
-    """Return log, topic and instance of a table that ``ulog2csv`` wrote, ("", "", 0) where its
-    name ends in none of these topics.
+    """Return log, topic and instance of a table of ``ulog2csv``; ("", "", 0) if its name does not
+    end in one of these topics.
     """
     stem, _, instance = path.stem.rpartition("_")
     topics = [name for name in names if stem.endswith(f"_{name}")]
@@ -132,7 +128,8 @@ def name_converted(path: Path, names: Collection[str]) -> tuple[str, str, int]:
 
 
 def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
-    """Read messages of ArduPilot's ``.BIN``; the time of VISP is that of its measurement.
+    """Read messages of ArduPilot's ``.BIN``; the time is that of the measurement for messages with
+    ``CTimeMS`` (VISP).
 
     Raises LogError: the file is no DataFlash log.
     """
@@ -167,25 +164,25 @@ def read_dataflash(path: str | Path, names: Collection[str]) -> Messages:
 
 
 def _read_next(log: Any, names: list[str], columns: "_Columns") -> Any:
-    """Return the next message; None at the end, and where the reader fails after it gave some."""
+    """Return the next message; None at the end, or if the reader fails after the first message."""
     try:
         return log.recv_match(type=names)
-    except Exception:  # pymavlink raises whatever struct, mmap and itself raise
+    except Exception:  # pymavlink also lets exceptions of struct and mmap pass
         if not columns.rows:
             raise
         return None
 
 
 NO_AUTOPILOT = 8
-"""MAV_AUTOPILOT_INVALID: the sender of a heartbeat flies nothing."""
+"""MAV_AUTOPILOT_INVALID: the sender of a heartbeat is no autopilot."""
 
 
 def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
-    """Read messages of a ``.tlog``, of the first sender of each, on one clock.
+    """Read messages of a ``.tlog``, each from its first sender, on one clock.
 
     The time is the sender's stamp. Senders count from their boot or from 1970, and some messages
-    have no stamp: each message's stamps are moved onto the clock of those that count from boot, by
-    the least delay with which they arrived.
+    have no stamp. So each message's stamps are shifted to the clock that counts from boot, by the
+    smallest delay of arrival.
 
     Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
@@ -199,7 +196,7 @@ def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
         if name not in names:
             continue
         if name == "HEARTBEAT" and message.autopilot == NO_AUTOPILOT:
-            continue  # of a ground station or a camera
+            continue  # from a ground station or a camera
         whose = (message.get_srcSystem(), message.get_srcComponent())
         if sender.setdefault(name, whose) != whose:
             unread[f"{name} of system {whose[0]}, component {whose[1]}"] += 1
@@ -217,11 +214,11 @@ def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
 
 
 OTHER_CLOCK = 1.0
-"""Difference of delays beyond which stamps are of another clock, and not late [s]."""
+"""Difference of delays above which stamps are of another clock [s]."""
 
 
 def _share_clock(fields: FieldsByMessage) -> None:
-    """Move stamps of messages onto one clock, in place: that of those that count from boot."""
+    """Shift the stamps of messages to one clock, that which counts from boot, in place."""
     delays = {
         key: float(np.min(series["arrival"] - series["time"])) for key, series in fields.items()
     }
@@ -238,7 +235,7 @@ def _share_clock(fields: FieldsByMessage) -> None:
 
 
 def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
-    """Yield arrival [s] and message of a ``.tlog``, past damaged bytes.
+    """Yield arrival [s] and message for each message of a ``.tlog``; damaged bytes are skipped.
 
     Raises LogError: the file cannot be read, or holds no MAVLink message.
     """
@@ -259,11 +256,10 @@ def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
                 if length
                 else None
             )
-        except Exception:  # of a damaged message, pymavlink raises whatever it stumbles over
+        except Exception:  # pymavlink raises many exceptions for damaged messages
             message = None
-        if (
-            message is None or message.get_msgId() < 0
-        ):  # an unknown one, whose checksum is not known either
+        # The checksum of an unknown message (number below 0) cannot be verified.
+        if message is None or message.get_msgId() < 0:
             position += 1  # look for the next message
             continue
         yield struct.unpack_from(">Q", data, position)[0] * 1e-6, message
@@ -276,9 +272,7 @@ def telemetry(path: str | Path) -> Iterator[tuple[float, Any]]:
 
 
 def _mavlink_length(data: bytes, position: int) -> int:
-    """Return the length of the message that begins at a place; 0 where none does, or it is cut
-    short.
-    """
+    """Return the length of the message at a position; 0 if none begins there or it is truncated."""
     head = data[position : position + 3]
     if len(head) < 3 or head[0] not in (0xFE, 0xFD):
         return 0
@@ -287,9 +281,7 @@ def _mavlink_length(data: bytes, position: int) -> int:
 
 
 class _Columns:
-    """Rows of messages, gathered by message and instance; a row that lacks a field of the first is
-    left out.
-    """
+    """Rows collected by message and instance; rows without a field of the first row are dropped."""
 
     def __init__(self) -> None:
         self.rows: dict[tuple[str, int], dict[str, list[float]]] = {}
@@ -310,19 +302,19 @@ class _Columns:
 
 
 class Forward(io.BytesIO):
-    """Bytes of a file for a reader that looks for the next message of a damaged log by stepping
-    back: never in a circle.
+    """A file in memory that stops a reader which steps back to the same byte of a damaged log again
+    and again.
     """
 
     def __init__(self, data: bytes):
-        """Begin at the first byte."""
+        """Open the file at its first byte."""
         super().__init__(data)
         self._returns: Counter[int] = Counter()
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Go to a byte, as in any file.
+        """Move to a byte, as ``io.IOBase.seek`` does.
 
-        Raises LogError: it leads to a byte that was returned to too often.
+        Raises LogError: the reader stepped back to that byte more than :data:`MOST_RETURNS` times.
         """
         before = self.tell()
         after = super().seek(offset, whence)
@@ -335,11 +327,10 @@ class Forward(io.BytesIO):
 
 @contextmanager
 def _report_parser_errors(path: str | Path, what: str) -> Iterator[list[str]]:
-    """Turn whatever a parser makes of a file that is none of its own into one error; what it prints
-    becomes a list.
+    """Turn any exception of a parser into a LogError, and collect the lines that it prints.
 
-    Some of them print a line a damaged byte, and past Python. Raises LogError: instead of any other
-    exception."""
+    Some parsers print a line for each damaged byte, also from C code: the file descriptor of stderr
+    is redirected too. Raises LogError for any exception."""
     output: list[str] = []
     heard = io.StringIO()
     try:

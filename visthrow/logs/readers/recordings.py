@@ -1,10 +1,8 @@
-"""Recordings of other tools as columns:
+"""Recordings as columns: ROS 1 and 2 bags, MCAP, MATLAB, HDF5, C3D and the Crazyflie's SD card.
 
-ROS 1 and 2 bags, MCAP, MATLAB, HDF5, and the Crazyflie's own log on a card.
-
-A recording holds several tables, each on a clock of its own: column ``drone/pose:position.x`` is of
-the table ``drone/pose``, whose stamps are ``drone/pose:time`` [s]. A mapping reads them as it reads
-a table's columns, each channel with its clock.
+A recording holds several tables, each with its own clock: column ``drone/pose:position.x`` belongs
+to the table ``drone/pose``, whose stamps are ``drone/pose:time`` [s]. A mapping treats them like
+the columns of one table, with a clock for each channel.
 
 Source: crazyflie-firmware, tools/usdlog/cfusdlog.py (the card's format); rosbags, mcap, scipy.io
 and h5py read the others."""
@@ -29,16 +27,16 @@ from visthrow.common.extras import load_extra
 from visthrow.common.storage import require_room
 from visthrow.logs.readers.table_to_log import Columns, Table
 
-# a matrix of more columns than this is a picture, a cloud of points or a covariance, and no signal;
-# a list of messages may hold a state of tens of numbers
+# Largest number of columns of a signal. Wider matrices are images, point clouds or covariances; the
+# state of a simulator may have tens of numbers.
 WIDEST = 64
 _CARD = 0xBC
 _CARD_TYPES = set("BbHhIiQqfdeL?")
 
 
 def read_recording(path: Path) -> Table:
-    """Read all columns of numbers from a file of one of :data:`READERS`, the folder of a ROS 2 bag,
-    or of the Crazyflie's card.
+    """Read all columns of numbers from a file with an extension of :data:`READERS`, the folder of a
+    ROS 2 bag, or a log of the Crazyflie's SD card.
 
     Raises LogError: a package is missing, or the file cannot be read or holds no numbers.
     """
@@ -50,7 +48,7 @@ def read_recording(path: Path) -> Table:
         table = reader(path)
     except LogError:
         raise
-    except Exception as error:  # readers of others raise what comes
+    except Exception as error:  # other packages raise exceptions of any type
         raise LogError(f"{path}: cannot be read: {error!r}; expected {what}") from error
     if not table:
         raise LogError(f"{path}: it has no columns of numbers")
@@ -58,19 +56,21 @@ def read_recording(path: Path) -> Table:
 
 
 def is_card(path: Path) -> bool:
-    """Tell whether a file without a known ending is of a Crazyflie's card."""
+    """Return whether a file without a known extension is a log of a Crazyflie's SD card."""
     with path.open("rb") as file:
         head = file.read(5)
     return len(head) == 5 and head[0] == _CARD and struct.unpack("<H", head[1:3])[0] in (1, 2)
 
 
 CARD_STAMPS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
-"""Version of a card's log -> form of an event's number and stamp, and the stamp's unit [s]."""
+"""Version of a card's log -> struct format of an event's number and stamp, and the stamp's unit
+[s].
+"""
 
 
 @dataclass
 class _CardEvent:
-    """An event of a card's log: a table."""
+    """A kind of event in a card's log, which becomes a table."""
 
     name: str
     fields: list[str]
@@ -79,7 +79,7 @@ class _CardEvent:
 
 
 def _card(path: Path) -> Table:
-    """Read the events of a card's log, each a table."""
+    """Read a card's log; each kind of event becomes a table."""
     data = path.read_bytes()
     version, kinds = _card_head(path, data)
     events, position = _card_events(path, data, kinds)
@@ -106,7 +106,7 @@ def _card(path: Path) -> Table:
 
 
 def _card_head(path: Path, data: bytes) -> tuple[int, int]:
-    """Return the version of a card's log and its number of events."""
+    """Return the version of a card's log and its number of kinds of events."""
     if len(data) < 9 or data[0] != _CARD:
         raise LogError(
             f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log from a"
@@ -123,7 +123,7 @@ def _card_head(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def _card_events(path: Path, data: bytes, kinds: int) -> tuple[dict[int, _CardEvent], int]:
-    """Return the announced events by their number, and where the first one begins."""
+    """Return the declared kinds of events by their number, and the position of the first event."""
     position = 5
     events = {}
     for _ in range(kinds):
@@ -180,8 +180,8 @@ def _hdf5(path: Path) -> Table:
 
 
 def _flatten(tree: dict[str, Any], prefix: str = "") -> Table:
-    """Columns of a tree of arrays: vectors as they are, matrices column by column, the longer side
-    being time.
+    """Turn a tree of arrays into columns: vectors unchanged, matrices column by column, with time
+    along the longer side.
     """
     table: Table = {}
     for name, value in tree.items():
@@ -211,13 +211,13 @@ def _flatten(tree: dict[str, Any], prefix: str = "") -> Table:
 
 
 def _open(item: Any) -> Any:
-    """Return the fields of a MATLAB struct that stands in a cell; anything else as it is."""
+    """Return the fields of a MATLAB struct in a cell; anything else unchanged."""
     fields = getattr(item, "_fieldnames", None)
     return item if fields is None else {name: getattr(item, name) for name in fields}
 
 
 def _bag(path: Path) -> Table:
-    """Topics of a ROS 1 or ROS 2 bag; the time is the header's stamp where there is one."""
+    """Read the topics of a ROS 1 or ROS 2 bag; the time is the header's stamp if there is one."""
     load_extra("rosbags.highlevel", "recordings", f"{path}: a ROS bag", LogError)
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -238,7 +238,7 @@ def _bag(path: Path) -> Table:
 
 
 def _mcap(path: Path) -> Table:
-    """Channels of an MCAP file: JSON as it is, ROS messages as of a bag."""
+    """Read the channels of an MCAP file, in JSON or as ROS messages."""
     reading = load_extra("mcap.reader", "recordings", f"{path}: an MCAP file", LogError)
     reader = reading.make_reader(io.BytesIO(path.read_bytes()))
     summary = reader.get_summary()
@@ -267,21 +267,26 @@ def _undecodable(raw: bytes) -> Any:
 
 
 LARGEST_MESSAGE = 20_000
-"""A message of more bytes is a picture or a cloud of points, and no signal."""
+"""Largest size of a message [bytes]. Larger ones are images or point clouds, not signals."""
 
 
 class Topics:
-    """Gathers numbers of messages, a table a topic; what cannot be read is named and left out."""
+    """A collector of the numbers in messages, with a table for each topic. Topics that cannot be
+    read are listed and left out.
+    """
 
     def __init__(self) -> None:
-        """Start without a topic."""
+        """Create a collector without topics."""
         self._rows: dict[str, list[dict[str, float]]] = {}
         self._left_out: dict[str, str] = {}
 
     def add(
         self, topic: str, label: str, arrival: float, raw: bytes, decode: Callable[[bytes], Any]
     ) -> None:
-        """Add a message, which arrived at a time [s], by what makes an object of its bytes."""
+        """Add a message.
+
+        ``label``: name of the topic for the user; ``arrival``: time [s]; ``decode``: function that
+        turns the bytes into an object."""
         topic = topic.strip("/").replace(":", ".")
         if topic in self._left_out:
             return
@@ -291,7 +296,7 @@ class Topics:
         try:
             row: dict[str, float] = {}
             add_numbers(row, decode(raw))
-        except Exception as error:  # readers of others raise what comes
+        except Exception as error:  # other packages raise exceptions of any type
             self._left_out[topic] = f"{label}: cannot be decoded: {error!r}"[:200]
             return
         heads = ("header.stamp", "stamp", "timestamp")
@@ -300,7 +305,9 @@ class Topics:
         self._rows.setdefault(topic, []).append(row)
 
     def table(self) -> Columns:
-        """Columns of all topics; a field that is missing in some messages is blank there."""
+        """Return the columns of all topics, with NaN where a message lacks a field.
+
+        Raises LogError: none of the topics can be read."""
         start = min(
             (row["time"] for messages in self._rows.values() for row in messages), default=0.0
         )
@@ -320,7 +327,7 @@ class Topics:
 
 
 def _stamp(row: dict[str, float], head: str) -> float:
-    """Seconds of a ROS stamp; 0 where the message has none."""
+    """Return the seconds of a ROS stamp; 0 if the message has none."""
     whole = row.get(f"{head}.sec", row.get(f"{head}.secs", 0.0))
     part = row.get(f"{head}.nanosec", row.get(f"{head}.nsecs", 0.0))
     return whole + 1e-9 * part
@@ -333,13 +340,13 @@ def _places(name: str, count: int) -> tuple[str, ...]:
 
 @cache
 def _members(kind: type, name: str) -> tuple[tuple[str, str], ...]:
-    """Members of a message and what they are called within it."""
+    """Return the fields of a message's type, and the full name of each."""
     members = [m for m in getattr(kind, "__dataclass_fields__", ()) if not m.startswith("__")]
     return tuple((member, f"{name}.{member}" if name else member) for member in members)
 
 
 def add_numbers(row: dict[str, float], value: Any, name: str = "") -> None:
-    """Add each number in a message to a row, by its name."""
+    """Add all numbers of a message to a row, by name, recursively."""
     if isinstance(value, (bool, int, float, np.integer, np.floating)):
         row[name] = float(value)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
@@ -357,17 +364,19 @@ def add_numbers(row: dict[str, float], value: Any, name: str = "") -> None:
 
 
 def _c3d(path: Path) -> Table:
-    """Markers of a C3D file [m], a blank where one is hidden; frames count from its rate."""
+    """Read the markers of a C3D file, in its unit; NaN for hidden markers. The time follows from
+    frame number and rate.
+    """
     c3d = load_extra("c3d", "recordings", f"{path}: a C3D file", LogError)
     with path.open("rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reader = c3d.Reader(file)
         if not reader.point_used:
             raise LogError(f"{path}: a C3D file without markers")
-        # analog channels are not read: their scales, which some writers leave out, do not count
+        # Analog channels are not read. So their scales, which some writers omit, are not needed.
         plain = (1.0, np.ones(reader.analog_used), np.zeros(reader.analog_used))
         reader.get_analog_transform_parameters = lambda: plain
-        # a list of labels may be longer than that of the points
+        # the list of labels may be longer than the number of points
         labels = [label.strip() for label in reader.point_labels[: reader.point_used]]
         units = reader.get("POINT:UNITS")
         unit = units.string_value.strip() if units is not None else "mm"
@@ -375,7 +384,7 @@ def _c3d(path: Path) -> Table:
     if not frames or not labels:
         raise LogError(f"{path}: a C3D file without markers")
     numbers = np.array([number for number, _ in frames], dtype=float)
-    # x, y, z, residual: below 0 where it is hidden
+    # x, y, z, residual; the residual of a hidden marker is below 0
     points = np.array([frame for _, frame in frames])
     hidden = points[:, :, 3] < 0.0
     table = Columns({"time [s]": (numbers - numbers[0]) / reader.point_rate})
@@ -395,4 +404,4 @@ READERS: dict[str, tuple[Callable[[Path], Table], str]] = {
     ".db3": (_bag, "a ROS 2 bag"),
     ".mcap": (_mcap, "an MCAP file"),
 }
-"""Ending -> reader, and what it expects."""
+"""Extension -> reader, and a description of the format."""

@@ -1,6 +1,6 @@
-"""CSV (plain, gzip, xz) and parquet tables into flight logs, by a mapping; our own exports without
-one.
-"""
+"""Conversion of CSV (plain, gzip, xz) and parquet tables to flight logs, by a mapping.
+
+Our own exports need no mapping."""
 
 import csv
 import gzip
@@ -38,7 +38,7 @@ _EXPORTED = re.compile(
     r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:,"
     r" (?P<frame>world|body|camera|image|mocap))?\]"
 )
-# no number of a flight is as large, in whatever unit; its square is still a number
+# larger numbers are invalid in any unit; the square of this one is still finite
 _LARGEST = 1e100
 _WORDS = {"True": 1.0, "False": 0.0}
 _LIST = re.compile(r"[\[(].*[\])]")
@@ -47,15 +47,15 @@ _OPENERS = {".gz": gzip.open, ".xz": lzma.open}
 
 
 class Columns(dict[str, np.ndarray]):
-    """Columns of a table by name, and what the file says beside them.
+    """Columns of a table by name, with settings of the file.
 
     Attributes:
-        left_out: Parts of the file that are not among the columns, and why.
-        settings: Settings above the numbers, such as a motion capture's.
+        left_out: Parts of the file that are not among the columns, with the reason.
+        settings: Settings in the lines above the numbers, such as those of a motion capture.
     """
 
     def __init__(self, *columns: Mapping[str, np.ndarray]) -> None:
-        """Hold columns, or none yet."""
+        """Create a table of columns, or an empty one."""
         super().__init__(*columns)
         self.left_out: list[str] = []
         self.settings: dict[str, str] = {}
@@ -64,11 +64,11 @@ class Columns(dict[str, np.ndarray]):
 def read_table(path: str | Path) -> Columns:
     """Read a table.
 
-    Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma,
-    lists stand in a cell (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); several lines may name
-    the columns (:mod:`visthrow.logs.readers.text_table`); without any they are called ``column 1``
-    and so on. Frames of a known rate get a column ``time [s]``. Raises LogError: it cannot be read,
-    has no rows, or a row has another number of cells than the header.
+    Cells may be separated by commas, semicolons, tabs or blanks. Decimals may have a comma. A cell
+    may hold a list (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``). Several lines may name the
+    columns (:mod:`visthrow.logs.readers.text_table`); without such a line their names are
+    ``column 1`` and so on. Frames of a known rate get a column ``time [s]``. Raises LogError: the
+    table cannot be read, has no rows, or a row has another number of cells than the header.
 
     Args:
         path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.tsv``, ``.txt`` or ``.parquet``.
@@ -84,14 +84,16 @@ def read_table(path: str | Path) -> Columns:
     for name, cells in zip(names, zip(*(row for _, row in layout.rows))):
         if any(cells):
             table |= _lists(name, cells) or {name: _column(cells, layout.comma)}
-        elif not name.startswith("column "):  # of a separator
+        elif not name.startswith("column "):  # an unnamed blank column is due to a separator
             table.left_out.append(f"{name}: blank throughout")
     _add_time(table, layout.rate)
     return table
 
 
 def _layout_of_file(path: Path) -> TextTable:
-    """Lay out a text table whose rows are all as wide as its header."""
+    """Return the layout of a text table, whose rows all have as many cells as its header.
+
+    Raises LogError: the file cannot be read, or is no such table."""
     packed = _OPENERS.get(path.suffix)
     try:
         data = unpack(path, packed, LogError) if packed else path.read_bytes()
@@ -117,7 +119,7 @@ def _layout_of_file(path: Path) -> TextTable:
 
 
 def _distinct(names: list[str]) -> list[str]:
-    """Return names of columns with a number behind each that stands again."""
+    """Return the names of columns with a number appended to each repetition."""
     counts: Counter[str] = Counter()
     distinct = []
     for name in names:
@@ -127,7 +129,7 @@ def _distinct(names: list[str]) -> list[str]:
 
 
 def _add_time(table: Columns, rate: float) -> None:
-    """Stamps of frames that count at a known rate, where no column is called a time, in place."""
+    """Add a column of time stamps to frames of a known rate [Hz], unless there is one, in place."""
     frames = next((table[name] for name in table if name.lower().startswith("frame")), None)
     timed = any(name.lower().startswith("time") for name in table)
     if rate > 0.0 and not timed and table:
@@ -138,7 +140,9 @@ def _add_time(table: Columns, rate: float) -> None:
 
 
 def _lists(name: str, cells: tuple[str, ...]) -> Table:
-    """Return a column for each place of a column of lists; nothing where its cells hold none."""
+    """Split a column of lists into one column per element; return no column if its first filled
+    cell holds no list.
+    """
     first = next((cell.strip() for cell in cells if cell.strip()), "")
     if not _LIST.fullmatch(first):
         return {}
@@ -193,9 +197,9 @@ def _text(value: object) -> str:
 
 
 def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
-    """Make flight logs of a table, which messages call its ``source``.
+    """Convert a table to flight logs; ``source``: name of the table in messages.
 
-    Raises LogError: a column is missing or holds no numbers, or nothing is left after splitting.
+    Raises LogError: a column is missing or holds no numbers, or no log is left after splitting.
     """
     count = len(next(iter(table.values())))
     parts = _parts(table, mapping, count, source)
@@ -207,7 +211,7 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
 
 
 def _numbers(table: Table, name: str, source: str) -> np.ndarray:
-    """Return the numbers of a column, negated where a minus stands before its name."""
+    """Return the numbers of a column, negated if a minus precedes its name."""
     if name not in table and name[:1] == "-":
         return -_numbers(table, name[1:], source)
     if name not in table:
@@ -234,7 +238,7 @@ def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
 def _parts(
     table: Table, mapping: TableMap, count: int, source: str
 ) -> list[tuple[np.ndarray, str]]:
-    """Rows and label of each log."""
+    """Return the indices of the rows and the label of each log."""
     split = mapping.split or Split()
     parts = [(np.arange(count), "")]
     if split.column:
@@ -265,7 +269,7 @@ def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: 
     meta: dict[str, Any] = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
     meta["left_out"] = list(getattr(table, "left_out", ()))
     channels = {}
-    taken = slice(None) if mapping.split is None else rows  # one for all clocks
+    taken = slice(None) if mapping.split is None else rows  # for all clocks alike
     for entry in mapping.channels:
         clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
         time = _stamps(table, clock, source)[taken]
@@ -289,30 +293,30 @@ def make_channel(
     source: str,
     bad: np.ndarray | None = None,
 ) -> tuple[Channel, dict]:
-    """Turn columns into a channel of ours.
+    """Convert columns to a channel.
 
-    Rows without a stamp, of a stamp that was there before, or of an earlier one are left out and
-    counted: a clock must go on. Where a single stamp is ahead of all that follow, that row is.
+    Rows without a time stamp, or whose stamp does not increase, are left out and counted. Of a
+    single stamp that is later than all that follow, only that row is left out.
 
     Args:
-        time: Stamps [s], shape (T,); NaN where there is none.
+        time: Stamps [s], shape (T,); NaN if missing.
         values: The columns, shape (T, C).
         entry: Their mapping.
-        source: What messages call the table.
-        bad: Rows that the source itself calls not valid, shape (T,); None: none.
+        source: Name of the table in messages.
+        bad: Rows that the source marks as invalid, shape (T,); None: none.
 
     Returns:
-        The channel, and how many rows were left out for which reason.
+        The channel, and the number of rows for each reason of being left out or invalid.
     """
     spec = STANDARD_CHANNELS.get(entry.name)
     unit, factor = to_si(entry.unit, f"channel '{entry.name}'")
     rows = forward_rows(time)
     notes = _counts_of(time)
-    blank = np.all(np.isnan(values[rows]), axis=1)  # such a row is of another channel
+    blank = np.all(np.isnan(values[rows]), axis=1)  # rows of other channels
     notes["blank"] = int(np.sum(blank))
     time = time[rows[~blank]]
     values = values[rows[~blank]]
-    valid = np.all(np.abs(values) < _LARGEST, axis=1)  # not where it is NaN
+    valid = np.all(np.abs(values) < _LARGEST, axis=1)  # false for NaN
     valid &= ~find_lost_rows(values)
     if bad is not None:
         valid &= ~bad[rows[~blank]]
@@ -342,13 +346,13 @@ def make_channel(
 
 
 def _find_changes(values: np.ndarray) -> np.ndarray:
-    """Tell the rows that differ from the row before, bool, shape (T,); the first one does."""
+    """Return whether each row differs from the one before, bool, shape (T,); true for the first."""
     same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
     return np.append(True, ~np.all(same, axis=1))
 
 
 def _counts_of(stamps: np.ndarray) -> dict[str, int]:
-    """Count rows, and those among them that keep a clock from going on."""
+    """Count rows, and those whose stamps are missing, repeated or earlier than the one before."""
     finite = np.isfinite(stamps)
     steps = np.diff(stamps[finite])
     return {
@@ -360,8 +364,8 @@ def _counts_of(stamps: np.ndarray) -> dict[str, int]:
 
 
 def forward_rows(stamps: np.ndarray) -> np.ndarray:
-    """Return the numbers of the rows that leave a clock going on: those later than all before, or
-    those earlier than all that follow, whichever are more; rows without a stamp are left out.
+    """Return the indices of rows with increasing stamps: those later than all before, or those
+    earlier than all after, whichever are more. Rows without a stamp are left out.
     """
     rows = np.flatnonzero(np.isfinite(stamps))
     time = stamps[rows]
@@ -371,9 +375,11 @@ def forward_rows(stamps: np.ndarray) -> np.ndarray:
 
 
 def find_lost_rows(values: np.ndarray) -> np.ndarray:
-    """Tell rows of three or more columns that are all zero where the body jumps to and from them:
-    a capture's word for a body that it does not see. Shape (T, C); returns bool, shape (T,).
-    """
+    """Return the rows in which a motion capture has lost the body and writes zeros, bool, shape
+    (T,).
+
+    Such rows of three or more columns are all zero, and their neighbours are far from zero.
+    ``values``: shape (T, C)."""
     zero = np.all(values == 0.0, axis=1)
     if values.shape[1] < 3 or not np.any(zero) or np.all(zero):
         return np.zeros(len(values), bool)
@@ -396,7 +402,7 @@ def _convert(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray
     if entry.kind == "matrix":
         good = np.abs(np.linalg.norm(values, axis=1) - np.sqrt(3.0)) < 0.1
         whole = np.where(good[:, None], values, np.eye(3).ravel())
-        matrices = whole.reshape(-1, 3, 3).transpose(0, 2, 1)  # column after column
+        matrices = whole.reshape(-1, 3, 3).transpose(0, 2, 1)  # column by column
         quat = quat_of_matrix(matrices) * good[:, None]
     elif entry.kind == "rotvec":
         quat = quat_of_vector(values)
@@ -412,10 +418,10 @@ def _convert(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarray
 
 
 def log_of_export(table: Table, path: Path) -> FlightLog | None:
-    """Read back a table that :func:`visthrow.logs.export.export` wrote, None for another one;
-    parquet carries the metadata.
+    """Convert a table of :func:`visthrow.logs.export.export` back to a flight log; None for any
+    other table. Only parquet holds the metadata.
 
-    Raises LogError: columns of one channel do not fit together.
+    Raises LogError: a channel lacks columns or is invalid.
     """
     names = [_EXPORTED.fullmatch(column) for column in table if column != "time [s]"]
     if "time [s]" not in table or not all(names):
@@ -441,7 +447,7 @@ def log_of_export(table: Table, path: Path) -> FlightLog | None:
             values = np.full((len(time), *shape), np.nan)
             for index, column in cells.items():
                 values[(slice(None), *index)] = column
-            # not where it is NaN
+            # false for NaN
             present = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)
             channels[name] = Channel(time[present], values[present], unit, frame)
         return FlightLog(channels, {"source": str(path), **_metadata(path)})
@@ -450,7 +456,7 @@ def log_of_export(table: Table, path: Path) -> FlightLog | None:
 
 
 def _metadata(path: Path) -> dict:
-    """Metadata of our own parquet export, or nothing."""
+    """Return the metadata of our own parquet export; {} for other files."""
     if path.suffix != ".parquet":
         return {}
     import pyarrow.parquet as pq

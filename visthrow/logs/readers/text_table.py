@@ -1,9 +1,9 @@
-"""Text tables as laboratories export them (Motive, Vicon, Qualisys, TUM, EuRoC): which lines hold
-numbers, what columns are called, in which units.
+"""Layout of text tables of laboratories (Motive, Vicon, Qualisys, TUM, EuRoC): rows of numbers,
+names and units of the columns.
 
-Tables of motion capture carry several lines above their numbers: settings, the name of a body, what
-is measured of it, its unit. A table's numbers begin where rows of one width, mostly of numbers,
-begin; lines of that width above them name the columns, the others are settings.
+Tables of motion capture have several lines above the numbers: settings, names of bodies, measured
+quantities, units. The numbers begin at the first of several rows of equal width that consist mostly
+of numbers. Lines of that width above them name the columns; the other lines are settings.
 
 Source: exports of OptiTrack Motive 1.2x and 3 (CSV), Vicon Nexus and Tracker (CSV), Qualisys Track
 Manager (TSV, 3D and 6D); trajectories of TUM (blank-separated) and EuRoC."""
@@ -20,53 +20,55 @@ from visthrow.common.storage import count_lines
 from visthrow.common.toml_text import tables_beside
 
 MARKS = (",", ";", "\t", " ")
-SAMPLED = 60  # lines of numbers from which the separator is determined
+SAMPLED = 60  # number of last lines that determine the separator
 _UNIT_WORDS = tables_beside(__file__)
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 _WORDS = ("true", "false")
 _FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*", re.I)
 _IDS = re.compile(r"\d+|([0-9a-f]+:)?[0-9a-f]{8,}", re.I)
 _KINDS = {"Type", "Parent", "Rigid Body", "Rigid Body Marker", "Marker", "Bone", "Bone Marker"}
-"""Of Motive's assets: words of lines that name no column."""
+"""Words of Motive's lines on kinds of assets, which name no column."""
 _KEY = re.compile(r"[A-Z]+(_[A-Z]+)+|EVENT")  # first cell of a line of Qualisys' settings
 SECTIONS = ("Objects", "Trajectories", "Segments", "Model Outputs", "Joints", "Devices")
-"""Tables of a file of Vicon, each below its title; the first of these that is there is read."""
+"""Titles of the tables in a file of Vicon, by priority: the first that exists is read."""
 RATES = ("FREQUENCY", "Export Frame Rate", "Capture Frame Rate", "Frame Rate")
 UNIT_OF_LENGTH = "Length Units"
 TUM = "timestamp tx ty tz qx qy qz qw"
 KITTI = "Rot[0] Rot[3] Rot[6] x Rot[1] Rot[4] Rot[7] y Rot[2] Rot[5] Rot[8] z"
-"""Columns of trajectories that are written without a head; of matrices column after column."""
+"""Columns of trajectories without a header; the names of matrix elements count column by column."""
 
 
 Rows = list[tuple[int, list[str]]]
-"""Numbers of lines, and their cells."""
+"""Line number and cells of each row."""
 
 
 @dataclass
 class TextTable:
-    """A text table, its cells still text."""
+    """A text table, with its cells as text."""
 
-    names: list[str]  # of the columns, with their unit in brackets where it is known
+    names: list[str]  # of the columns, with their unit in brackets if it is known
     rows: Rows
-    comma: bool  # whether decimals are written with a comma
-    settings: dict[str, str] = field(default_factory=dict)  # of the lines above
-    rate: float = 0.0  # of the frames, where the table says it [Hz]
+    comma: bool  # whether decimals have a comma
+    settings: dict[str, str] = field(default_factory=dict)  # from the lines above the numbers
+    rate: float = 0.0  # of the frames [Hz]; 0: unknown
     left_out: list[str] = field(default_factory=list)  # other tables of the file
 
 
 def is_number(cell: str) -> bool:
-    """Tell whether a cell holds a number, with a point or a comma."""
+    """Return whether a cell holds a number, with a decimal point or comma."""
     return bool(_NUMBER.fullmatch(cell.strip()))
 
 
 def unit_of(word: str) -> str | None:
-    """Our spelling of a unit, "" for what has none; None for a word that is no unit."""
+    """Return our spelling of a unit; "" for a quantity without unit, None if the word is no
+    unit.
+    """
     return _UNIT_WORDS.get(word.strip().strip("[]()").strip().lower())
 
 
 def layout_of(text: str, name: str = "") -> TextTable:
-    """Lay out a text table that messages call by a name; without a line of numbers its rows are
-    empty.
+    """Return the layout of a text table; ``name``: of the table in messages. Without a line of
+    numbers, there are no rows.
     """
     mark = _separator(text.splitlines())
     blank = mark == " "
@@ -81,7 +83,7 @@ def layout_of(text: str, name: str = "") -> TextTable:
     named, settings, rate = _sort_head(head, _names_start(rows, start), width, blank)
     unnamed = width > len(named[-1] if named else [])
     if unnamed and len(body) > 1 and all(cells[-1] == "" for _, cells in body):
-        body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
+        body = [(line, cells[:-1]) for line, cells in body]  # every line ends with a separator
         width -= 1
     names = _names(named, width, settings) if named else _marker_names(width, settings)
     names = names or _headless_names(body, width, blank)
@@ -89,7 +91,7 @@ def layout_of(text: str, name: str = "") -> TextTable:
 
 
 def _cells(text: str, mark: str, name: str) -> Rows:
-    """Cells of each line that holds any."""
+    """Return the stripped cells of each line that is not blank."""
     blank = mark == " "
     lines = count_lines(io.StringIO(text, newline=""), len(text), name)
     reader = csv.reader(lines, delimiter=mark, skipinitialspace=blank)
@@ -104,8 +106,8 @@ def _cells(text: str, mark: str, name: str) -> Rows:
 
 
 def _find_first_row(rows: Rows, width: int) -> int:
-    """Return the row at which the numbers begin: identifiers above them are numbers too, but three
-    rows of numbers in a line are the table.
+    """Return the index of the first row of numbers. Three rows of numbers in succession are needed,
+    as identifiers above the table may be numbers too.
     """
     good = [_holds_numbers(cells) for _, cells in rows]
     fits = [len(cells) == width and valid for (_, cells), valid in zip(rows, good)]
@@ -114,15 +116,17 @@ def _find_first_row(rows: Rows, width: int) -> int:
 
 
 def _names_start(rows: Rows, start: int) -> int:
-    """Return the row at which the names of the columns begin: below the last empty line, if that
-    does not stand between the names and the numbers.
+    """Return the index of the row at which the names of the columns begin: the one after the last
+    empty line, unless that line directly precedes the numbers.
     """
     below_gap = [i for i in range(1, start + 1) if rows[i][0] > rows[i - 1][0] + 1]
     return below_gap[-1] if below_gap and below_gap[-1] < start else 0
 
 
 def _section(rows: Rows) -> tuple[Rows, list[str]]:
-    """Return the table to read of a file that holds several, and what is left out."""
+    """Return the rows of the table to be read from a file of several, and a text for each of the
+    others.
+    """
     titles = {cells[0].strip(): i for i, (_, cells) in enumerate(rows) if not any(cells[1:])}
     starts = {title: titles[title] for title in SECTIONS if title in titles}
     if len(starts) < 2:
@@ -134,14 +138,14 @@ def _section(rows: Rows) -> tuple[Rows, list[str]]:
 
 
 def _separator(lines: list[str]) -> str:
-    """Return the mark that cuts most lines into the same number of cells, most of them numbers."""
+    """Return the separator with the highest :func:`_regularity`."""
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
     return max(MARKS, key=lambda mark: round(_regularity(sample, mark), 6))
 
 
 def _regularity(sample: list[str], mark: str) -> float:
-    """Return the share of lines that a mark cuts into the usual number of cells, times the share of
-    numbers in them; 0 where it cuts none.
+    """Return the share of lines that a separator splits into the most frequent number of cells,
+    times the share of numbers in these lines; 0 if it splits none.
     """
     rows = [next(csv.reader([line.strip()], delimiter=mark)) for line in sample]
     if mark == " ":
@@ -157,8 +161,8 @@ def _regularity(sample: list[str], mark: str) -> float:
 
 
 def _holds_numbers(cells: list[str]) -> bool:
-    """Whether at least half of a line's filled cells are numbers or lists, one of the first three
-    among them; behind more columns of text two thirds must be.
+    """Return whether at least half of a line's filled cells are numbers or lists; two thirds, if
+    none of the first three is a number.
     """
     filled = [cell for cell in cells if cell]
     good = sum(
@@ -181,7 +185,7 @@ def _commas(mark: str, body: Rows) -> bool:
 def _sort_head(
     head: Rows, cut: int, width: int, blank: bool
 ) -> tuple[list[list[str]], dict[str, str], float]:
-    """Lines above the numbers: those that name columns, the settings, and the rate."""
+    """Return the lines above the numbers that name columns, the settings, and the rate [Hz]."""
     named = []
     settings: dict[str, str] = {}
     rate = 0.0
@@ -205,13 +209,15 @@ def _sort_head(
 
 
 def _names_columns(cells: list[str], width: int) -> bool:
-    """Whether a line is as wide as the table, and fills more than half of it or starts blank."""
+    """Return whether a line names columns: it is at most as wide as the table, and more than half
+    filled or with a blank first cell.
+    """
     count = sum(map(bool, cells))
     return len(cells) <= width and (count > width / 2 or not cells[0])
 
 
 def _strip_comment(cells: list[str], width: int) -> list[str]:
-    """Cells of a line of the head without the mark of a comment and surplus blanks at its end."""
+    """Return the cells of a header line without comment mark and without surplus blank cells."""
     if cells[0].startswith(("#", "%")):
         first = cells[0].lstrip("#% ")
         cells = [first, *cells[1:]] if first else cells[1:]
@@ -221,7 +227,7 @@ def _strip_comment(cells: list[str], width: int) -> list[str]:
 
 
 def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list[str]:
-    """Names of columns, of all lines that name them, unlike each other."""
+    """Return the names of the columns, composed from all lines that name them."""
     several = len(named) > 1
     units, parts = _units_and_words(named, width)
     final = next((row for row in reversed(named) if not _is_row_of_units(row)), named[-1])
@@ -236,7 +242,7 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
 
 
 def _units_and_words(named: list[list[str]], width: int) -> tuple[list[str], list[list[str]]]:
-    """Return each column's unit, "" where no line says it, and the words that name it."""
+    """Return the unit of each column ("" if unknown), and the words of its name."""
     several = len(named) > 1
     units = [""] * width
     parts: list[list[str]] = [[] for _ in range(width)]
@@ -249,21 +255,22 @@ def _units_and_words(named: list[list[str]], width: int) -> tuple[list[str], lis
 
 
 def _is_row_of_units(row: list[str]) -> bool:
-    """Whether every filled cell of a row is a unit."""
+    """Return whether every filled cell of a row is a unit."""
     return all(unit_of(cell) is not None for cell in row if cell)
 
 
 def _identifies(row: list[str], several: bool) -> bool:
-    """Whether a row holds identifiers, or kinds of Motive's assets, and names nothing."""
+    """Return whether a row holds identifiers or kinds of Motive's assets, and no names."""
     filled = [cell for cell in row if cell]
     numbers = len(filled) > 1 and all(_IDS.fullmatch(cell) for cell in filled[1:])
     return numbers or (several and bool(filled) and _KINDS.issuperset(filled))
 
 
 def _add_names(parts: list[list[str]], row: list[str]) -> None:
-    """Add a row's words to the names of their columns: where the row's first cell is empty, a
-    body's name stands above the first of its columns alone.
-    """
+    """Add the words of a row to the names of the columns, in place.
+
+    If the row's first cell is empty, a word also applies to the blank cells after it: a body's name
+    is above the first of its columns only."""
     last = ""
     for i, cell in enumerate(row):
         last = cell or ("" if row[0] else last)
@@ -272,7 +279,9 @@ def _add_names(parts: list[list[str]], row: list[str]) -> None:
 
 
 def _join(name: str, unit: str, settings: dict[str, str]) -> str:
-    """Return a name with its unit; a subject that bears the name of its body is named once."""
+    """Return a column's name with its unit in brackets, without repeated words: subject and body
+    may have the same name.
+    """
     parts = name.split(".")
     name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
     if not unit and UNIT_OF_LENGTH in settings and "Position" in parts:
@@ -287,7 +296,9 @@ def _join(name: str, unit: str, settings: dict[str, str]) -> str:
 
 
 def _add_body_names(names: list[str]) -> list[str]:
-    """Qualisys' columns: the body's name stands before its first, and its lengths are in mm."""
+    """Return Qualisys' names with the body's name and the unit added to each of its columns.
+
+    The body's name precedes the first of them only; lengths are in mm."""
     joined = []
     body = ""
     for name in names:
@@ -308,8 +319,9 @@ def _add_body_names(names: list[str]) -> list[str]:
 
 
 def _headless_names(body: Rows, width: int, blank: bool) -> list[str]:
-    """Names of a trajectory without a head, known by what its numbers are: TUM's eight columns end
-    in a unit quaternion xyzw, KITTI's twelve are a rotation matrix and a place, row by row.
+    """Return the column names of a table without a header, recognised by its numbers: TUM's eight
+    columns end in a unit quaternion xyzw; KITTI's twelve are rotation matrix and position, row by
+    row.
     """
     cells = [row for _, row in body[:SAMPLED]]
     numbers = all(is_number(cell) and "," not in cell for row in cells for cell in row)
@@ -325,7 +337,9 @@ def _headless_names(body: Rows, width: int, blank: bool) -> list[str]:
 
 
 def _marker_names(width: int, settings: dict[str, str]) -> list[str]:
-    """Qualisys' 3D export may have no line of names, but the markers' names above it."""
+    """Return the column names of Qualisys' 3D export without a line of names, from the setting
+    ``MARKER_NAMES``; [] if it does not fit.
+    """
     markers = [word for word in settings.get("MARKER_NAMES", "").split("\t") if word]
     before = ["Frame", "Time"][: width - 3 * len(markers)] if markers else []
     if not markers or len(before) + 3 * len(markers) != width:

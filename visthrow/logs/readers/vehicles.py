@@ -1,4 +1,4 @@
-"""What vehicle an autopilot's log is of, and which of its outputs drives which rotor.
+"""The kind of vehicle of an autopilot's log, and the output that drives each rotor.
 
 ``vehicles.toml`` has the numbers by which autopilots name vehicles.
 
@@ -16,33 +16,35 @@ TABLES = tables_beside(__file__)
 ARDUPILOT_MOTOR1 = 33  # SERVOn_FUNCTION of the first motor
 
 X = (2, 0, 1, 3)
-"""Motors of PX4's and ArduPilot's quadrotor X: front left, front right, rear left, rear right."""
+"""Indices of the motors of PX4's and ArduPilot's quadrotor X: front left, front right, rear left,
+rear right.
+"""
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The vehicle of a log, as far as the log names it."""
+    """The vehicle of a log, as far as the log identifies it."""
 
-    kind: str = ""  # "": the log does not say
-    # motors, from 0, that are front left, front right, rear left, rear right; () where it has
-    # other ones than those four
+    kind: str = ""  # "": unknown
+    # indices of the motors front left, front right, rear left, rear right; () if it has other
+    # motors than these four
     motors: tuple[int, ...] = X
     outputs: tuple[int, ...] = X  # their outputs, from 0
 
     @property
     def rotors_alone(self) -> bool:
-        """Whether rotors on fixed arms carry it, or the log does not say."""
+        """True if rotors on fixed arms carry the vehicle, or its kind is unknown."""
         return self.kind in ("", "tricopter") or "rotor" in self.kind
 
 
 def vehicle_of(log: Messages) -> Vehicle:
-    """Say which vehicle a log is of."""
+    """Return the vehicle of a log."""
     reader = {"ulog": _read_px4, "dataflash": _read_ardupilot}.get(log.kind, _read_heartbeat)
     return reader(log)
 
 
 def _name_of(table: str, number: float, default: Any = "") -> Any:
-    """Return what a table of ``vehicles.toml`` calls a number."""
+    """Return the entry of a number in a table of ``vehicles.toml``."""
     return TABLES[table].get(str(int(number)), default)
 
 
@@ -71,7 +73,9 @@ def _kind_of_px4(parameters: Mapping[str, float]) -> str:
 
 
 def _order_motors(parameters: Mapping[str, float]) -> tuple[int, ...]:
-    """Motors by where they sit; () where each quarter has not one."""
+    """Return the motors in the order front left, front right, rear left, rear right; () unless
+    there is one in each quadrant.
+    """
     corners: dict[tuple[bool, bool], int] = {}
     for i in range(4):
         forward, right = (parameters.get(f"CA_ROTOR{i}_P{axis}", 0.0) for axis in "XY")

@@ -1,3 +1,1 @@
-"""Betaflight blackbox logs, raw or decoded to CSV: bit packing, frames, and the channels of a
-flight log.
-"""
+"""Betaflight blackbox logs, raw or decoded to CSV: bytes, frames, and channels of a flight log."""

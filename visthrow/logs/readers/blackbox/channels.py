@@ -1,7 +1,8 @@
-"""Blackbox logs, raw or decoded to CSV, as flight logs.
+"""Conversion of blackbox logs, raw or decoded to CSV, to flight logs.
 
-Convention: Betaflight's body axes are ours (x forward, y left, z up; a level vehicle at rest feels
-+1 g along z). Its motors are rear right, front right, rear left, front left."""
+Convention: Betaflight's body axes are ours (x forward, y left, z up; the accelerometer of a level
+vehicle at rest reads +1 g along z). Its motors are rear right, front right, rear left, front left.
+"""
 
 import re
 from collections.abc import Iterable
@@ -18,7 +19,7 @@ from visthrow.logs.readers.table_to_log import Table, make_channel
 
 TABLES = tables_beside(__file__)
 MOTOR_ORDER = (3, 1, 2, 0)
-"""Betaflight's motor of each of ours: front left, front right, rear left, rear right."""
+"""Index of Betaflight's motor for each of ours: front left, front right, rear left, rear right."""
 
 _CLOCK_TURN = 2**32
 _UNIT = re.compile(r"\s*\([^()]*\)$")
@@ -28,7 +29,7 @@ _GYRO_SCALE = 1.0  # gyroADC is logged in deg/s since Betaflight 3.1
 
 
 def logs_of_blackbox(path: str | Path) -> list[FlightLog]:
-    """Read a raw file: one flight log each log in it. Raises LogError as :func:`read_blackbox`."""
+    """Read all logs of a raw file as flight logs. Raises LogError as :func:`read_blackbox`."""
     logs = read_blackbox(path)
     tables = [dict(zip(log.names, log.main.T.astype(np.float64))) for log in logs]
     return [
@@ -38,17 +39,16 @@ def logs_of_blackbox(path: str | Path) -> list[FlightLog]:
 
 
 def is_decoded(table: Table) -> bool:
-    """Tell whether a table is a blackbox log decoded to CSV."""
+    """Return whether a table is a blackbox log decoded to CSV."""
     names = {_UNIT.sub("", name) for name in table}
     return {"loopIteration", "time", "gyroADC[0]"} <= names
 
 
 def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
-    """Make a flight log of a decoded CSV; its units are those of the raw log, or stand in brackets
-    behind the names.
+    """Convert a decoded CSV to a flight log. Units are those of the raw log, or in brackets after
+    the columns' names.
 
-    Raises LogError: a column has a unit in brackets that is not known, or the stamps are no
-    numbers."""
+    Raises LogError: the unit of a column is unknown, or the time stamps are no numbers."""
     plain = {}
     for name, values in table.items():
         bare = _UNIT.sub("", name)
@@ -59,7 +59,7 @@ def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
 
 
 def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
-    """Factor from the bracketed unit to what the raw log holds."""
+    """Return the factor from the unit in brackets to the raw log's unit."""
     factors = TABLES["units"]
     if unit not in factors:
         raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(factors)}")
@@ -103,7 +103,7 @@ def _number_names(name: str, numbers: Iterable[int]) -> tuple[str, ...]:
 
 
 def _sensor_channels(header: dict[str, str]) -> list[ChannelMap]:
-    """Return the channels of sensors and set-points."""
+    """Return the mappings of sensors and set-points."""
     acc_1g = float(header.get("acc_1G", _ACC_1G)) or _ACC_1G
     scales = {"gyro": _gyro_scale(header), "acc": 1.0 / acc_1g}
     rows = [row | {"scale": scales.get(row.get("scale"), 1.0)} for row in TABLES["sensed"]]
@@ -111,7 +111,7 @@ def _sensor_channels(header: dict[str, str]) -> list[ChannelMap]:
 
 
 def _map_motors(table: Table, header: dict[str, str]) -> list[ChannelMap]:
-    """Return the channels of motors."""
+    """Return the mappings of motor commands and motor speeds."""
     low, high = (float(x) for x in header.get("motorOutput", _MOTOR_OUTPUT).split(","))
     span = (high - low) or 1.0
     count = sum(1 for name in table if re.fullmatch(r"motor\[\d\]", name))

@@ -1,5 +1,4 @@
-"""The byte level of Betaflight's blackbox: variable-length integers, packed groups, and predictions
-of fields.
+"""Byte level of Betaflight's blackbox: variable-length integers and packed groups of fields.
 
 Source: Betaflight, "Blackbox logging internals" (docs/development/Blackbox Internals.md), data
 version 2."""
@@ -28,27 +27,29 @@ class EndOfLog(Exception):
 
 
 class Corrupt(Exception):
-    """The bytes cannot be what they should be."""
+    """The bytes do not follow the format."""
 
 
 class Reader:
     """A position in the bytes of one log."""
 
     def __init__(self, data: bytes, pos: int = 0):
-        """Stand at ``pos``."""
+        """Create a reader at byte ``pos``."""
         self.data = data
         self.pos = pos
         self.end = len(data)
 
     def byte(self) -> int:
-        """Next byte. Raises EndOfLog: there is none."""
+        """Read a byte. Raises EndOfLog: there is none."""
         if self.pos >= self.end:
             raise EndOfLog
         self.pos += 1
         return self.data[self.pos - 1]
 
     def unsigned(self) -> int:
-        """Variable-length number, low bits first. Raises Corrupt: longer than 32 bits."""
+        """Read an unsigned variable-length number, low bits first. Raises Corrupt: it is longer
+        than 32 bits.
+        """
         value = 0
         for shift in range(0, 7 * _LONGEST_VB, 7):
             byte = self.byte()
@@ -58,25 +59,25 @@ class Reader:
         raise Corrupt
 
     def signed(self) -> int:
-        """Variable-length number, zig-zag."""
+        """Read a signed variable-length number in zig-zag encoding."""
         value = self.unsigned()
         return (value >> 1) ^ -(value & 1)
 
     def little(self, size: int) -> int:
-        """Signed little-endian number of so many bytes."""
+        """Read a signed little-endian number of ``size`` bytes."""
         return extend(sum(self.byte() << (8 * i) for i in range(size)), 8 * size)
 
     def float32(self) -> float:
-        """Little-endian float."""
+        """Read a little-endian float of 32 bits."""
         return float(np.frombuffer(bytes(self.byte() for _ in range(4)), "<f4")[0])
 
 
 Decoder = Callable[[Reader, int], list[int]]
-"""What reads so many fields."""
+"""A function that reads a number of fields at once."""
 
 
 def extend(value: int, bits: int) -> int:
-    """Read the lowest bits as a two's complement number."""
+    """Interpret the lowest ``bits`` of a value as a two's complement number."""
     value &= (1 << bits) - 1
     return value - (1 << bits) if value >> (bits - 1) else value
 
@@ -89,8 +90,8 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
 
 
 def _three(one: tuple, two: tuple) -> Decoder:
-    """Three fields by the two highest bits: within a byte, one or two more (where each field's bits
-    end, and how many), or byte by byte.
+    """Return a decoder of three fields. The two highest bits of the first byte select the layout:
+    one byte, ``one`` or ``two`` more bytes (shift and width of each field), or whole bytes.
     """
     places = (((4, 2), (2, 2), (0, 2)), one, two)
 
@@ -107,7 +108,7 @@ def _three(one: tuple, two: tuple) -> Decoder:
 
 
 def _tag8_4s16(r: Reader, count: int) -> list[int]:
-    """Four fields of 0, 4, 8 or 16 bits each, packed nibble to nibble."""
+    """Read four fields of 0, 4, 8 or 16 bits each, packed by nibbles."""
     tag = r.byte()
     values = []
     pending = 0  # bits read and not used yet
@@ -136,10 +137,10 @@ DECODERS: dict[int, Decoder] = {
 
 
 def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Decoder, int, int]]:
-    """Return decoder, first field and number of fields of each group of fields that are packed
-    together, by the encoding of each field.
+    """Group fields that are packed together, by the encoding of each field.
 
-    ``skipped`` fields take no bytes at all (those counted up by one).
+    ``skipped``: fields without bytes (those incremented by one). Returns decoder, first field and
+    number of fields of each group.
     """
     groups = []
     i = 0

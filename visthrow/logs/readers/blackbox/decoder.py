@@ -1,7 +1,7 @@
-"""Raw Betaflight blackbox files (.bbl, .bfl): headers and frames of every log in the file.
+"""Decoder of raw Betaflight blackbox files (.bbl, .bfl): header and frames of every log in a file.
 
-A frame that does not decode is dropped, and nothing is believed until the next frame that stands on
-its own (I). A file may end within a frame.
+A frame that cannot be decoded is dropped, and so are all frames until the next one that needs no
+predecessor (I). A file may end within a frame.
 
 Source: Betaflight, "Blackbox logging internals"; frame checks as in Betaflight's
 blackbox-log-viewer."""
@@ -31,7 +31,7 @@ FRAMES = b"IPSGHE"
     LAST_MAIN_TIME,
     MINMOTOR,
 ) = range(12)
-"""Predictors; those of GPS frames, which are skipped, do not matter."""
+"""Predictors. Those of GPS frames are missing, as these frames are skipped."""
 _LONGEST_FRAME = 256  # bytes
 _LONGEST_GAP_US = 10_000_000
 _MOST_ITERATIONS = 5000 * 10
@@ -49,7 +49,7 @@ _EVENTS = {
 
 @dataclass
 class Fields:
-    """Definition of one kind of frame."""
+    """Definition of the fields of one kind of frame."""
 
     names: list[str] = field(default_factory=list)
     signed: list[int] = field(default_factory=list)
@@ -59,22 +59,22 @@ class Fields:
 
 @dataclass
 class BlackboxLog:
-    """One log of a file, in the units of the file."""
+    """A decoded log, in the units of the file."""
 
     header: dict[str, str]
     names: list[str]  # of the columns of ``main``
     main: np.ndarray  # shape (T, fields), int64
     events: list[tuple[str, tuple[float, ...]]] = field(default_factory=list)
     frames: dict[str, int] = field(default_factory=dict)  # kind -> number decoded
-    corrupt: int = 0  # stretches of bytes that could not be decoded
-    dropped: int = 0  # frames decoded but resting on a damaged one
+    corrupt: int = 0  # number of byte ranges that could not be decoded
+    dropped: int = 0  # frames that were decoded but depend on a damaged one
     complete: bool = False  # whether the log ends with its end marker
 
 
 def read_blackbox(path: str | Path) -> list[BlackboxLog]:
     """Read every log of a raw file.
 
-    Raises LogError: no such file, no blackbox file, or none of its logs holds a frame.
+    Raises LogError: the file does not exist, is no blackbox file, or none of its logs has a frame.
     """
     try:
         data = Path(path).read_bytes()
@@ -107,7 +107,7 @@ def read_blackbox(path: str | Path) -> list[BlackboxLog]:
 
 
 class _Decoder:
-    """Decodes one log: header lines, then frames until the end."""
+    """A decoder of one log: header lines, then frames until the end."""
 
     def __init__(self, data: bytes):
         self.header: dict[str, str] = {}
@@ -201,7 +201,7 @@ class _Decoder:
                 reader.pos = start + 1
                 continue
             lost = False
-            if kind != "E" and not frame:  # decoded, but rests on what was lost
+            if kind != "E" and not frame:  # decoded, but depends on a lost frame
                 log.dropped += 1
                 continue
             log.frames[kind] = log.frames.get(kind, 0) + 1
@@ -211,7 +211,7 @@ class _Decoder:
         return log
 
     def _frame(self, kind: str, log: BlackboxLog) -> Frame | None:
-        """Values of the next frame; empty: not to be used; None: no frame."""
+        """Return the values of the next frame; empty: not usable; None: no frame begins here."""
         reader = self.reader
         start = reader.pos
         reader.pos += 1
@@ -235,7 +235,7 @@ class _Decoder:
         return values
 
     def _note_event(self, log: BlackboxLog) -> Frame | None:
-        """Note the next event; None: no event."""
+        """Add the next event to the log; return None if there is no event."""
         event = _event(self.reader)
         if event is None:
             return None
@@ -281,7 +281,9 @@ class _Decoder:
         raise Corrupt
 
     def _count_skipped(self) -> int:
-        """Return the iterations since the last main frame that are left out on purpose."""
+        """Return the number of iterations after the last main frame that are not logged, by the
+        header's sampling.
+        """
         if self.last_iteration is None:
             return 0
         following = range(self.last_iteration + 1, self.last_iteration + 1 + self.interval)
@@ -291,8 +293,8 @@ class _Decoder:
         return next((count for count, keep in enumerate(logged) if keep), self.interval)
 
     def _continuous(self, values: Frame, kind: str) -> bool:
-        """Whether time and iteration go on; one I frame that jumps is refused, and the next one
-        believed wherever it stands.
+        """Return whether time and iteration follow those of the last frame. After a rejected I
+        frame, the next one is accepted at any time.
         """
         if self.last_time is None:
             return True
