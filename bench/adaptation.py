@@ -24,7 +24,7 @@ from bench import loop, start
 from bench import report as records
 from visthrow.common import compute_device, statistics
 from visthrow.common.storage import write_json
-from visthrow.diagnose.apply.patch import extended
+from visthrow.diagnose.apply.patch import extend
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of, load_experiment
 from visthrow.training.protocol import throw
@@ -64,7 +64,7 @@ def measure_errors(
         return json.loads(kept.read_text())
     nominal = load_experiment("state", [ADAPTATION, *args.changes])
     shipped = Policy.load(find_policy("state"))
-    altered = extended(nominal, hidden)
+    altered = extend(nominal, hidden)
     policy, figures = adapt(altered, shipped, args)
     errors = {"hidden": dict(hidden), **figures}
     for stage, experiment, thrower in zip(

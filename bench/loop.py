@@ -38,7 +38,7 @@ from visthrow.common import mocap, statistics, toml_text, workers
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
-from visthrow.diagnose.apply.patch import extended
+from visthrow.diagnose.apply.patch import extend
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.paper.results import DIGITS
 from visthrow.task import Experiment, load_experiment
@@ -118,7 +118,7 @@ class Loop:
     def run(self, say: Callable[[str], None]) -> dict[str, Any]:
         """Run the loop, or resume an earlier run; returns the record."""
         nominal = load_experiment(self.base)
-        truth = extended(nominal, self.hidden)
+        truth = extend(nominal, self.hidden)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._config("hidden", truth)
         begin = time.perf_counter()
@@ -148,7 +148,7 @@ class Loop:
             report(f"named: {', '.join(f'{n} {v:.4g}' for n, v in theta.items()) or 'nothing'}")
             throws = dict.fromkeys(WHO)
             if theta:
-                self._config("extended", extended(nominal, theta))
+                self._config("extended", extend(nominal, theta))
                 time_stage("training", self._train, "extended")
                 throws["after"] = time_stage(
                     "throws after", self._throws, "after", str(self.folder / "extended" / POLICY)

@@ -34,7 +34,7 @@ from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.reporting import diagnosis_report as report
-from visthrow.diagnose.reporting.gain import on_others
+from visthrow.diagnose.reporting.gain import evaluate_on_others
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.diagnose_flights import diagnose
 from visthrow.logs.check.run import check
@@ -485,7 +485,7 @@ def run(task: tuple[Case, Path]) -> dict:
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     with tempfile.TemporaryDirectory() as folder:
         name, model_of = _open_setup(case.setup, Path(folder))
-        known = setups.known(name)
+        known = setups.describe_vehicle(name)
         logs = case.change(_read(case.files, data, name))
         try:
             diagnosis = diagnose(logs, model_of(logs), vehicle=known)
@@ -534,7 +534,7 @@ def _measure_unseen(
     writes, and of noise alone.
     """
     extended.extend(SavedDiagnosis(report.to_json(diagnosis), "the diagnosis").sizes[0])
-    measured = on_others(plain, extended, {}, diagnosis).errors
+    measured = evaluate_on_others(plain, extended, {}, diagnosis).errors
     return {channel: list(errors) for channel, errors in measured.items()}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.integrals import Integrals
-from visthrow.diagnose.likelihood.marginal import correlated_of, gram_of
+from visthrow.diagnose.likelihood.marginal import correlate_all, gram_of
 from visthrow.diagnose.models.model_interface import Model
 
 
@@ -27,7 +27,7 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     noise, _ = levels.fit(windows_by_size[-1], raw[-1])
     squares = []
     for windows, grams in zip(windows_by_size, raw):
-        shaped = correlated_of(grams, windows, noise.correlation_time)
+        shaped = correlate_all(grams, windows, noise.correlation_time)
         statistics = Integrals(shaped, noise).statistics(shaped, np.zeros(len(priors.floor)))
         squares.append(statistics.square.sum())
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(

@@ -12,7 +12,7 @@ from gimbal_model import SLUNG_LOAD, GimbalModel
 from visthrow.diagnose import diagnose
 from visthrow.diagnose.inputs.setup import read_logs
 from visthrow.diagnose.reporting.diagnosis_report import summary
-from visthrow.diagnose.reporting.gain import on_others
+from visthrow.diagnose.reporting.gain import evaluate_on_others
 
 
 def main() -> None:
@@ -27,7 +27,7 @@ def main() -> None:
     print(summary(diagnosis))
     if args.test:
         others = GimbalModel(read_logs(args.test, "slungload_camera"), SLUNG_LOAD)
-        tested = on_others(others, others, diagnosis.expected, diagnosis)
+        tested = evaluate_on_others(others, others, diagnosis.expected, diagnosis)
         for channel, (before, after, noise) in tested.errors.items():
             print(f"tested, {channel}: {before:.3g} -> {after:.3g} m, noise alone {noise:.3g}")
 

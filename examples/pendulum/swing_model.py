@@ -130,7 +130,7 @@ class PendulumModel(NumericModel):
             sine = np.sin(angle)
             dry = coulomb * np.tanh(rate / SMOOTH)
             friction = viscous * rate + dry + quadratic * np.abs(rate) * rate
-            force = push[index] + self.exerted("payload force", state)[:, ::2]
+            force = push[index] + self.exert("payload force", state)[:, ::2]
             pull = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
             change = np.empty_like(state)
             change[:, 0] = rate

@@ -16,7 +16,7 @@ from visthrow.diagnose.models.numeric import (
     NumericModel,
     Stretch,
     command_of,
-    exerted,
+    exert,
 )
 from visthrow.logs.flightlog import FlightLog
 
@@ -137,7 +137,7 @@ class TrimModel(NumericModel):
         off_x = (bare * com_x + added @ x) / total
         off_y = (bare * com_y + added @ y) / total
         draught = self.pushes_at(lanes, np.array([0.5]))[0]
-        for block, loads in exerted(self.laws, self._means(stretch)).items():
+        for block, loads in exert(self.laws, self._means(stretch)).items():
             load = np.mean(loads, axis=0)
             if block == "vehicle force":
                 draught[:, 0] += load[2]

@@ -13,7 +13,7 @@ from bench.diagnose import cases
 from bench.diagnose.bad import BAD
 from bench.diagnose.degenerate import PAIRS
 from bench.worlds.world import Recipe
-from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
+from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thin
 from visthrow.logs.flightlog import FlightLog
 
 SMALL = dict(free=1, free_seconds=1.0, throws=2)
@@ -59,12 +59,12 @@ def test_of_hours_of_flight_all_throws_and_the_liveliest_windows_are_looked_at()
     lively = (time % 60.0 >= 30.0) & (time % 60.0 < 31.0)  # a second of each minute
     command = np.outer(np.sin(7.0 * time) * (0.01 + lively), np.ones(4))
     flight = argparse.Namespace(command_time=time, command=command)
-    kept = thinned([*hover, *throws], [flight, flight])
+    kept = thin([*hover, *throws], [flight, flight])
     assert len(kept) == 100
     assert [c for c in kept if c.flight == 1] == throws
     assert max(b.start - a.start for a, b in pairwise(kept[:70])) < 250.0
     assert all(c.start % 60.0 == 30.0 for c in kept[:70])
-    assert thinned(throws, [flight, flight]) == throws
+    assert thin(throws, [flight, flight]) == throws
 
 
 def explain_failure(line: dict) -> str:

@@ -8,7 +8,7 @@ from pytest import mark
 from sim.params import LawParams
 from tests.configs import load_experiment
 from tests.flown import fly, setting_with
-from visthrow.diagnose.apply.patch import extended
+from visthrow.diagnose.apply.patch import extend
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import DiagnosedParams
 from visthrow.training.trainer import Trainer
@@ -26,7 +26,7 @@ def test_training_in_an_extended_simulator():
         ((1e-8, 0.0, 0.0), (0.0, 1e-8, 0.0), (0.0, 0.0, 1e-6)),
         4,
     )
-    experiment = extended(
+    experiment = extend(
         plain,
         {
             "payload_drag": 1e-3,

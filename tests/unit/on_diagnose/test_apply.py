@@ -181,7 +181,7 @@ def test_every_effect_can_be_written():
             content = patch.text("train/state.toml", before, theta, [[1e-12]], 1, ["test"])
             after = config.loads(Experiment, content)
             assert after != before, name
-            assert patch.extended(before, theta).vehicle == after.vehicle, name
+            assert patch.extend(before, theta).vehicle == after.vehicle, name
 
 
 def test_draws_keep_what_is_pinned_together():

@@ -30,7 +30,7 @@ def plant(params):
 def hovered(params):
     """A diagnosis of a hover of the setup's vehicle, and the simulator of its manoeuvres."""
     (hover,) = fly_manoeuvres.fly(
-        plant(params), [fly_manoeuvres.carried(BASES["hover"], params)], 0
+        plant(params), [fly_manoeuvres.adapt_to_payload(BASES["hover"], params)], 0
     )
     model = FlyerModel(
         [hover.setup_log(params, {params.position: 3e-4, "payload_pos_w": 3e-4})], params
@@ -68,7 +68,7 @@ def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
 
 @mark.parametrize("base", BASES.values(), ids=lambda m: m.name)
 def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(base: Manoeuvre):
-    same = design.designed(base, design.Limits(), design.START)
+    same = design.design(base, design.Limits(), design.START)
     for name in ("pos_w", "yaw", "rates_b", "thrust_factor", "release"):
         np.testing.assert_allclose(
             getattr(same, name), getattr(base, name), atol=1e-12, err_msg=name
@@ -76,7 +76,7 @@ def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(bas
     limits = design.Limits(half=(1.5, 1.0), highest=2.0, speed=1.5)
     allowed = limits.around(base.pos_w)
     for numbers in np.random.default_rng(3).random((20, len(design.NUMBERS))):
-        r = design.designed(base, limits, numbers)
+        r = design.design(base, limits, numbers)
         moved = np.abs(r.pos_w[:, :2]).max(0)
         assert np.all(moved <= np.array(allowed.half) + 1e-9)
         assert (
@@ -95,7 +95,9 @@ def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
     cable, bare = (setup.load(name).flyer for name in ("cf_payload", "nanobench_cf21"))
     for params in (cable, bare):
         flown = [
-            m for m in (fly_manoeuvres.carried(m, params) for m in BASES.values()) if m is not None
+            m
+            for m in (fly_manoeuvres.adapt_to_payload(m, params) for m in BASES.values())
+            if m is not None
         ]
         assert {m.payload for m in flown} == {params.cable is not None}
         assert not any(np.any(m.release) for m in flown)
@@ -107,7 +109,9 @@ def test_the_simulated_flight_of_a_setup_is_one_that_its_model_explains(name):
     anything is left without any effect.
     """
     params = setup.load(name).flyer
-    chosen = [fly_manoeuvres.carried(BASES[m], params) for m in ("fast passes x", "circle")]
+    chosen = [
+        fly_manoeuvres.adapt_to_payload(BASES[m], params) for m in ("fast passes x", "circle")
+    ]
     for flight in fly_manoeuvres.fly(plant(params), chosen, 0):
         model = FlyerModel([flight.setup_log(params, {})], params)
         off = np.concatenate(model.residuals({}))

@@ -5,7 +5,7 @@ from numpy.random import default_rng
 
 from visthrow.diagnose.likelihood.evidence import MODEL_ERROR_FLOOR, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.candidates import allowed, between_flights
+from visthrow.diagnose.select.candidates import between_flights, find_tolerance
 
 SIZE, OTHER = 20.0, 0.3
 """Of the named effect and of one that is not named, in floors."""
@@ -39,7 +39,7 @@ def interval(statistics: Statistics) -> tuple[float, float]:
     spread = posterior.covariance([0])
     size = spread[0] @ posterior.score
     unlike, kept = between_flights(statistics, PRIORS, [0], np.array([size, 0.0]))
-    more = unlike * kept[0] * allowed(size) ** 2
+    more = unlike * kept[0] * find_tolerance(size) ** 2
     return size, np.sqrt(spread[0, 0] + MODEL_ERROR_FLOOR**2 + more)
 
 
@@ -47,7 +47,7 @@ def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
     """Worlds of three to eight flights, each with its own deviation among them."""
     rng, held = default_rng(3), 0
     for _ in range(TRIED):
-        deviation = abs(rng.standard_normal()) * allowed(SIZE)
+        deviation = abs(rng.standard_normal()) * find_tolerance(SIZE)
         size, sd = interval(
             flights(SIZE + deviation * rng.standard_normal(rng.integers(3, 9)), rng)
         )

@@ -148,16 +148,16 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
         replace(f, low=-f.low, verdict=result.CANDIDATE) if f.name == "effect_05" else f
         for f in diagnosis.findings
     ]
-    wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
+    wide = held_out.judge(replace(diagnosis, findings=tuple(findings)))
     assert (wide.overall, dict(wide.theta)) == (result.UNKNOWN, {})
     assert wide["effect_05"].verdict == result.CANDIDATE
     assert "interval holds 0" in wide.reasons[0]
     rivals = [replace(f, low=abs(f.low)) for f in findings]
-    rivalled = held_out.judged(replace(diagnosis, findings=tuple(rivals)))
+    rivalled = held_out.judge(replace(diagnosis, findings=tuple(rivals)))
     assert "sets of causes without them" in rivalled.reasons[0]
     assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
     findings = [replace(f, nats=-1.0) if f.name == "effect_05" else f for f in findings]
-    unasked = held_out.judged(replace(diagnosis, findings=tuple(findings)))["effect_05"]
+    unasked = held_out.judge(replace(diagnosis, findings=tuple(findings)))["effect_05"]
     assert (unasked.verdict, unasked.estimate) == (result.BOUNDED, 0.0)
     assert unasked.sentence.endswith("if present at all.")
 
@@ -182,7 +182,7 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     assert diagnosis.theta == {"effect_05": printed.estimate}
     assert printed.sd**2 <= diagnosis.covariance[0][0] < printed.sd**2 + printed.differs**2
     work = diagnosis.work
-    trained = held_out.crossed(diagnosis).trained
+    trained = held_out.cross_validate(diagnosis).trained
     sizes = trained[:, work.active[0]] * EFFECTS[5].floor
     assert np.all(np.abs(sizes - printed.estimate) < 3.0 * printed.sd)
     assert not trained[:, 2].any()  # nor is the candidate written

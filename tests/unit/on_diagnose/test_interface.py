@@ -16,7 +16,7 @@ from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
 from visthrow.diagnose.throw import command_mistakes as interface
-from visthrow.diagnose.throw.command_mistakes import suspected
+from visthrow.diagnose.throw.command_mistakes import suspect
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -70,12 +70,12 @@ def change_command(log, change):
 @mark.parametrize("name", WRONG)
 def test_each_mistake_is_suspected_and_put_right(logs, name):
     wrong = [change_command(log, WRONG[name]) for log in logs]
-    mistakes = suspected(wrong, PLANT)
+    mistakes = suspect(wrong, PLANT)
     assert [m.name for m in mistakes] == [name.split(" ")[0]]
     assert mistakes[0].logs == 3
     for log, meant in zip(wrong, logs):
         assert_allclose(
-            mistakes[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
+            mistakes[0].mend(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
         )
 
 
@@ -87,20 +87,20 @@ def test_mistakes_that_come_together_are_all_suspected(logs):
         )
         for log in logs
     ]
-    assert [m.name for m in suspected(turned, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
+    assert [m.name for m in suspect(turned, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
 
 
 def test_good_logs_and_logs_that_disagree_are_not_suspected(logs):
-    assert suspected(logs, PLANT) == []
+    assert suspect(logs, PLANT) == []
     mixed = [change_command(logs[0], WRONG["rate_axes"]), *logs[1:]]
-    assert suspected(mixed, PLANT) == []
+    assert suspect(mixed, PLANT) == []
     strangers = [
         change_command(log, lambda u, other=other: other["command"].values)
         for log, other in zip(logs, [*logs[1:], logs[0]])
     ]
-    assert suspected(strangers, PLANT) == []
+    assert suspect(strangers, PLANT) == []
     heavier = [change_command(log, lambda u: u * [1.6, 1.0, 1.0, 1.0]) for log in logs]
-    assert suspected(heavier, PLANT) == []
+    assert suspect(heavier, PLANT) == []
 
 
 def simulate(logs):

@@ -14,7 +14,7 @@ from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
 from visthrow.diagnose.inputs.proposal import propose, propose_model
-from visthrow.diagnose.throw.command_mistakes import commanded
+from visthrow.diagnose.throw.command_mistakes import derive_commands
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs import read, table_of
 from visthrow.logs.check.run import check, contradictions
@@ -68,7 +68,7 @@ def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_p
             ]
     assert (mine.time.column, mine.time.unit) == (shipped.time.column, shipped.time.unit)
     log = read(file, mine)[0]
-    assert not contradictions(check([log], setup.known(tmp_path / "mine.toml")))
+    assert not contradictions(check([log], setup.describe_vehicle(tmp_path / "mine.toml")))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -441,7 +441,7 @@ def test_a_throttle_becomes_a_command_in_newtons():
     late = Channel(columns["time"] + 0.003, columns.pop("quat_wb"), "1", "world")
     rates = columns.pop("command")[:, 1:]
     log = log_of(columns | {"throttle": ahead, "rate_setpoint_b": rates}, quat_wb=late)
-    (made,), (mistake,) = commanded([log], plant)
+    (made,), (mistake,) = derive_commands([log], plant)
     assert mistake.name == "throttle"
     assert "throttle / 0.37" in mistake.equation
     command = made["command"]

@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.integrals import Integrals
-from visthrow.diagnose.likelihood.integrals import fitted as fitted_windows
+from visthrow.diagnose.likelihood.integrals import fit_windows as fitted_windows
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 EFFECTS = catalogue(6)
@@ -85,7 +85,7 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         windows[0],
         sigma=np.where(np.arange(len(windows[0].sigma)) % 7, 1.0, 3.0) * windows[0].sigma,
     )
-    gram = marginal.correlated(marginal.gram_of(spared, floors, 2), spared, levels.correlation_time)
+    gram = marginal.correlate(marginal.gram_of(spared, floors, 2), spared, levels.correlation_time)
     for window, of, choice in (
         (windows[0], grams[0], levels),
         (windows[0], grams[0], other),

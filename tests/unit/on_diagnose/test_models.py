@@ -34,7 +34,7 @@ from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerPa
 from visthrow.diagnose.models.quadrotor.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.reporting.diagnosis_report import summary
-from visthrow.diagnose.reporting.gain import on_others
+from visthrow.diagnose.reporting.gain import evaluate_on_others
 from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -108,13 +108,13 @@ class TestBall:
         )
         unseen = paths + default_rng(2).normal(0.0, 5e-4, paths.shape)
         others = beside_aeroid.model_of(stamps, unseen)
-        errors = on_others(others, others, diagnosis.theta, diagnosis).errors
+        errors = evaluate_on_others(others, others, diagnosis.theta, diagnosis).errors
         before, after, noise = errors["payload_pos_w"]
         assert before > 20.0 * noise
         assert 0.7 * noise < after < 1.3 * noise
         for stretch in others.stretches:
             stretch.residual[10::60] += 0.3
-        tested = on_others(others, others, diagnosis.theta, diagnosis)
+        tested = evaluate_on_others(others, others, diagnosis.theta, diagnosis)
         assert tested.outliers >= sum(len(s.residual[10::60]) for s in others.stretches)
         assert tested.errors["payload_pos_w"][1] < 2.0 * noise
 
@@ -271,7 +271,7 @@ class TestFlyer:
     @mark.parametrize("stated", [(), ("wind_x=0", "wind_y=0")])
     def test_wind_is_named_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
         model = self.in_wind(monkeypatch, 0.1, drag=0.03, wind=1.5)
-        model.effects = measures.narrowed(model.effects, measures.parsed(stated))
+        model.effects = measures.narrow(model.effects, measures.parse(stated))
         if stated:
             model.choose(["wind_x", "wind_y"])  # nothing else may take their place
         diagnosis = explain_without_laws(model)

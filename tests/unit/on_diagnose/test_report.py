@@ -95,7 +95,7 @@ def test_prediction_does_not_look_at_what_it_predicts(diagnosed):
     window = point.windows[0]
     late = window.time > window.time.min() + 0.7
     plain, spoilt = (
-        forms.predicted(window, point.noise, residual)[0]
+        forms.predict(window, point.noise, residual)[0]
         for residual in (window.residual, window.residual + late)
     )
     assert_allclose(spoilt[~late], plain[~late])
@@ -172,7 +172,7 @@ def test_a_name_needs_three_flights_that_tell_of_it(telling, repeats):
         posterior=Posterior(flights.sum(0), np.zeros(1), goal.priors),
         statistics=SimpleNamespace(information=flights),
     )
-    assert goal.settled(np.full((1, 1), 100.0)) == ([(0,)], repeats)
+    assert goal.settle(np.full((1, 1), 100.0)) == ([(0,)], repeats)
 
 
 def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
@@ -187,15 +187,15 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     }
     assert not plan.propose(plan.PlanningGoal(degenerate, ("effect_00",)), [])
     model = twins()
-    model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
+    model.effects = measures.narrow(EFFECTS, measures.parse([f"effect_07={scale.sd}"]))
     assert explain_without_laws(model)["effect_03"].verdict == result.FOUND
 
 
 @mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1,effect_07=1"])
 def test_measurements_that_are_none_are_refused(item):
-    assert measures.parsed(["a=1,b=2", "c=3"]) == {"a": 1.0, "b": 2.0, "c": 3.0}
+    assert measures.parse(["a=1,b=2", "c=3"]) == {"a": 1.0, "b": 2.0, "c": 3.0}
     with raises(DiagnoseError, match=item.split("=")[0]):
-        measures.narrowed(EFFECTS, measures.parsed([item]))
+        measures.narrow(EFFECTS, measures.parse([item]))
 
 
 @mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
@@ -219,7 +219,7 @@ def test_a_flight_that_nears_the_ground_has_no_model(part, used):
     assert chosen.lowest == approx(0.055)
     place = np.repeat(chosen.pos_w, 4, axis=0) - [0.0, 0.0, part * chosen.lowest]
     flight = fly_manoeuvres.SimulatedFlight(chosen, None, {"pos_w": place}, None, None)
-    simulated = flight.simulated(lambda _: "a model")
+    simulated = flight.simulate(lambda _: "a model")
     assert simulated.used == approx(used)
     assert (simulated.model is None) == (used > 1.0)
 
@@ -244,7 +244,7 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
 
     flights = [level(0.0), level(0.2 * np.pi)]
     assert [flight.swing for flight in flights] == approx([90.0, 54.0])
-    assert [flight.simulated(lambda _: "a model").model for flight in flights] == [None, "a model"]
+    assert [flight.simulate(lambda _: "a model").model for flight in flights] == [None, "a model"]
 
 
 def test_the_report_holds_sentences_pictures_and_numbers(

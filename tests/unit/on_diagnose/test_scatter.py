@@ -29,10 +29,10 @@ from visthrow.diagnose.select.candidates import (
     Candidate,
     Scatter,
     estimate_shares,
-    freed,
+    integrate_shares,
+    list_shared,
     random_shares,
-    relinearised_per_flight,
-    shared,
+    relinearise_per_flight,
 )
 from visthrow.diagnose.select.occam import Linear, window
 
@@ -44,7 +44,7 @@ LEAST = 4.0
 
 def choose(statistics, effects=EFFECTS, priors=PRIORS, least=LEAST):
     """Return the best set of candidates, and the deviations of its random shares in their unit."""
-    offered = shared(effects) + random_shares(effects, priors, statistics)
+    offered = list_shared(effects) + random_shares(effects, priors, statistics)
     linear = Linear(statistics, priors, offered, lambda s: sum(least + c.penalty for c in s))
     near = window(linear, {NOTHING})
     best = max(near, key=near.get)
@@ -132,7 +132,7 @@ def share(j, group, size):
 def test_a_mean_is_as_certain_as_its_number_of_days():
     """Three flights of a day give no more information on the days' common size than one does."""
     statistics = campaign(default_rng(10), 5, 0.012, 0.0)
-    by_flight, by_day = (freed(statistics, share(0, who, 6.0)) for who in (FLIGHT, DAY))
+    by_flight, by_day = (integrate_shares(statistics, share(0, who, 6.0)) for who in (FLIGHT, DAY))
     assert len(by_day.flights) == 5
     sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
     assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
@@ -208,7 +208,7 @@ def delay_jitter(diagnosis):
 
 def test_what_single_flights_differ_by_is_integrated_out():
     statistics, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
-    left = freed(statistics, share(j, FLIGHT, size))
+    left = integrate_shares(statistics, share(j, FLIGHT, size))
     information = statistics.information[0]
     score = statistics.score[0]
     theta = default_rng(4).normal(size=K)
@@ -300,8 +300,8 @@ EFFECT = next(v for v in random_effects() if v.name == "lag_jitter")
 
 def jitter(statistics, again):
     if again is not None:
-        statistics = relinearised_per_flight(statistics, np.zeros(len(NAMES)), PRIORS, 0, again)
-    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, statistics, ())
+        statistics = relinearise_per_flight(statistics, np.zeros(len(NAMES)), PRIORS, 0, again)
+    offered = list_shared(EFFECTS) + random_shares(EFFECTS, PRIORS, statistics, ())
     share = next(c for c in offered if c.name == "lag_jitter")
     linear = Linear(statistics, PRIORS, offered, lambda _: 0.0)
     return verdicts.share_verdict(linear, share, frozenset(offered[:1]), {}, EFFECT, LEAST)

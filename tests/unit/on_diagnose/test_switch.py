@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue, explain_without_laws
-from visthrow.diagnose.select.point import Problem, fitted, linearise
+from visthrow.diagnose.select.point import Problem, fit, linearise
 
 EFFECTS = tuple(replace(e, switch=i == 3) for i, e in enumerate(catalogue(6)))
 
@@ -15,7 +15,7 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
     problem = Problem(model, tuple(range(len(model.windows({})))))
     for at in (0.0, 7.0):
         point = linearise(problem, np.where(np.arange(6) == 3, at, 0.0))
-        refitted = fitted(point, [1, 3])
+        refitted = fit(point, [1, 3])
         assert refitted.theta[3] == at
         assert abs(refitted.theta[1]) > 2.0
 

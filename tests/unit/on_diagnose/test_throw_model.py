@@ -26,7 +26,7 @@ from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select.diagnose_flights import explain
-from visthrow.diagnose.select.point import curvature, moved
+from visthrow.diagnose.select.point import curvature, move
 from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -168,9 +168,9 @@ def test_initial_states_follow_the_effects(planted):
     nominal, size = linearise_flights(model), np.array([15.0])
     blind = {i: replace(w, effects=0.0 * w.effects) for i, w in nominal.about.windows.items()}
     fixed = replace(nominal, about=replace(nominal.about, windows=blind))  # its states stay behind
-    follow, behind = (moved(point, size) for point in (nominal, fixed))
+    follow, behind = (move(point, size) for point in (nominal, fixed))
     assert curvature(nominal, follow) < 0.2 * curvature(nominal, behind)
-    back = moved(follow, np.zeros(1))  # there and back again
+    back = move(follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
         assert_allclose(again.residual, w.residual, atol=1e-9)
 
@@ -371,7 +371,7 @@ def test_the_answer_counts_the_windows_that_are_left_out(monkeypatch):
 
 def test_a_path_comes_down_between_two_points():
     path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
-    assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
+    assert_allclose(landing._find_crossing(path, 0.5), [1.25, 0.125, 0.5])
 
 
 SWAY = 0.02 * np.array([1.0, 1.0, 1.0]), np.array([0.7, 0.9, 0.5]), np.array([0.0, 1.0, 2.0])
@@ -405,7 +405,7 @@ BENDING = 0.1
 
 def begun(model: ThrowModel) -> dict[str, np.ndarray]:
     """States at the starts of a model's windows."""
-    return model.begun({}, model.flights.cuts)[1]
+    return model.begin({}, model.flights.cuts)[1]
 
 
 @fixture(scope="module")

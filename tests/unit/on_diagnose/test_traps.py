@@ -29,7 +29,7 @@ def record(number: int) -> FlightLog:
     return setups.read_logs([REAL / "payload_cf_single" / f"log{number}.csv.gz"], "cf_payload")[0]
 
 
-CRAZYFLIE = setups.known("cf_payload")
+CRAZYFLIE = setups.describe_vehicle("cf_payload")
 PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 LATE = 0.1
 

@@ -25,7 +25,7 @@ from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import with_latent_effects
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
+from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, tabulate_unexplained, train
 from visthrow.diagnose.select import diagnose_flights, result, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
@@ -281,9 +281,7 @@ def select_beside_law(
     """A selection that holds some names and laws."""
     point = linearise_flights(model)
     if active_terms:
-        (point,) = terms.extended(
-            [point], [terms.as_effect(term, 0.1, 7.0) for term in active_terms]
-        )
+        (point,) = terms.extend([point], [terms.as_effect(term, 0.1, 7.0) for term in active_terms])
     columns = [*active, *range(len(model.effects), len(point.theta))]
     selector = Selector(point, 4.0)
     chosen = frozenset(c for c in selector.candidates if c.group == ALL and c.columns[0] in columns)
@@ -305,7 +303,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block, monkeypatch):
     parts = terms.Integrals(grams, best.noise).statistics(grams, best.theta)
     of = terms.Survey(best, parts, []).screen(block)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        (point,) = terms.extended([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
+        (point,) = terms.extend([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
         scale = point.problem.priors.floor[-1]
         assert point.information[-1, -1] == approx(scale**2 * of.information[i, 0, 0], rel=1e-6)
         assert point.posterior.score[-1] == approx(
@@ -371,7 +369,7 @@ def test_the_table_takes_up_what_no_name_explains():
     velocity = window.knots["vel_w"]
     truth = -0.02 * norm(velocity, axis=1)[:, None] * velocity
     assert norm(predicted - truth) < LEFT * norm(truth)
-    data = unexplained(point, 0)
+    data = tabulate_unexplained(point, 0)
     again = ForceTable(
         *(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"])
     )

@@ -23,8 +23,8 @@ from tests.flightlogs import (
     upright,
     with_channels,
 )
-from visthrow.diagnose.inputs.setup import VELOCITIES, known
-from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
+from visthrow.diagnose.inputs.setup import VELOCITIES, describe_vehicle
+from visthrow.diagnose.select.diagnose_flights import diagnose, find_refused
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import relate
@@ -229,8 +229,8 @@ def test_a_late_channel_that_no_model_reads_refuses_no_log():
     checked = check([log_of(columns, vel_w=late)])
     assert "vel_w" in contradictions(checked)[0]
     assert not contradictions(checked, VELOCITIES)
-    assert refused_of(checked) == (0,)
-    assert refused_of(checked, known(None)) == ()
+    assert find_refused(checked) == (0,)
+    assert find_refused(checked, describe_vehicle(None)) == ()
 
 
 def test_a_late_attitude_refuses_a_log_by_the_velocity_that_follows_its_position():
@@ -244,7 +244,7 @@ def test_a_late_attitude_refuses_a_log_by_the_velocity_that_follows_its_position
             for name in ("quat_wb", "rate_b", "acc_b", "command")
         }
         logs.append(log_of(columns, **airborne))
-    assert refused_of(check(logs), known(None)) == (1,)
+    assert find_refused(check(logs), describe_vehicle(None)) == (1,)
     (reason,) = contradictions(check(logs), VELOCITIES)
     assert "d(vel_w)/dt, quat_wb acc_b: the second is +" in reason
     assert "streams on clocks apart" in reason

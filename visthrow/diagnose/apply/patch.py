@@ -29,7 +29,7 @@ from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, load_experiment, plant_of
 
 
-def extended(experiment: Experiment, theta: Sizes) -> Experiment:
+def extend(experiment: Experiment, theta: Sizes) -> Experiment:
     """Return the experiment with these effects in its plant and sensors.
 
     Raises ConfigError: an effect that the catalogue does not hold.
@@ -97,7 +97,7 @@ def text(
     )
     every_law = (*experiment.laws, *laws)
     check_laws(every_law)
-    after = replace(extended(experiment, theta), diagnosed=varied, laws=every_law)
+    after = replace(extend(experiment, theta), diagnosed=varied, laws=every_law)
     changed = differences(config.to_dict(load_experiment(base)), config.to_dict(after))
     words = defaultdict(list)
     for effect, sd in zip(effects, np.sqrt(np.diag(covariance))):

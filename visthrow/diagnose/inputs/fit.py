@@ -73,7 +73,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     ``model``: linearisable; its windows' latent forces and noise levels are estimated on the way.
     Raises DiagnoseError: a name that the model does not have, or none.
     """
-    from visthrow.diagnose.select.point import Problem, fitted, linearise
+    from visthrow.diagnose.select.point import Problem, fit, linearise
 
     names = [effect.name for effect in model.effects]
     expect_known(free, names, "no effect '{}' to fit", DiagnoseError)
@@ -85,7 +85,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     point = linearise(problem, np.zeros(len(names)), windows=before)
     for _ in range(ROUNDS):
         start = point.theta
-        point = fitted(point, columns)
+        point = fit(point, columns)
         point = linearise(problem, point.theta, point.noise)
         if np.max(np.abs(point.theta - start)) < 0.5:  # floors
             break

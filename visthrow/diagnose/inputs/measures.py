@@ -40,7 +40,7 @@ RIGHT = 1e-3  # deviation of a value that is stated to be right, in what is negl
 MEASUREMENTS = tuple(Measurement(name, **row) for name, row in tables_beside(__file__).items())
 
 
-def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
+def narrow(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
     """The catalogue where some configured values were measured.
 
     ``measured``: effect -> deviation of the measurement that the configuration's value comes from,
@@ -66,7 +66,7 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     return tuple(changed)
 
 
-def parsed(items: Sequence[str]) -> dict[str, float]:
+def parse(items: Sequence[str]) -> dict[str, float]:
     """Read ``NAME=DEVIATION`` of the command line, several by commas.
 
     Raises DiagnoseError: something else."""

@@ -59,7 +59,7 @@ class Opened:
             if args.only is not None:
                 model.choose(args.only)
         if args.measured:
-            model.effects = measures.narrowed(model.effects, measures.parsed(args.measured))
+            model.effects = measures.narrow(model.effects, measures.parse(args.measured))
         # day of each flight, from 0: what its log says, else those of one folder are of one
         names = [
             str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs
@@ -70,7 +70,7 @@ class Opened:
     @property
     def known(self) -> KnownVehicle:
         """Return what is known of the vehicle."""
-        vehicle = setup.known(self._args.config)
+        vehicle = setup.describe_vehicle(self._args.config)
         return replace(vehicle, unread=vehicle.unread.union(self._args.overrule))
 
     def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
@@ -98,7 +98,7 @@ class Opened:
         return replace(diagnosis, reasons=(*diagnosis.reasons, note))
 
 
-def made_with(args: argparse.Namespace) -> dict[str, Any]:
+def describe_origin(args: argparse.Namespace) -> dict[str, Any]:
     """Entries of a diagnosis' JSON that say what was diagnosed:
 
     ``apply`` builds on nothing else.

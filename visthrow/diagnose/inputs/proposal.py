@@ -16,7 +16,7 @@ from numpy import ndarray
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.columns import NAMES, PATTERNS, groups_of, moves, rises, unit_by_name
 from visthrow.diagnose.inputs.recognition import Recognition
-from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, by_mass
+from visthrow.diagnose.inputs.unit_evidence import LIGHTEST, THRUSTS, find_unit_by_mass
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
@@ -59,7 +59,7 @@ def propose(
     if not any(moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
     proposal = MappingProposal()
-    proposal.mapping = _mapping(numbers, proposal, getattr(table, "settings", {}), time_unit)
+    proposal.mapping = _map_columns(numbers, proposal, getattr(table, "settings", {}), time_unit)
     mapped = proposal.mapping.columns if proposal.mapping is not None else set()
     proposal.left_out = [name for name in table if name not in mapped]
     proposal.left_out += getattr(table, "left_out", [])
@@ -101,7 +101,7 @@ def propose_model(log: FlightLog, mass: float | None = None) -> MappingProposal:
     return proposal
 
 
-def _mapping(
+def _map_columns(
     numbers: Table, proposal: MappingProposal, settings: dict[str, str], time_unit: str | None
 ) -> TableMap | None:
     """Map the columns of numbers, and say why and ask in a proposal; None without a channel."""
@@ -242,8 +242,8 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
                 f"{thrust}: newtons of all motors together, as taken? It carries {listed}"
             )
         return
-    unit = by_mass(one, weighed, units)
-    in_grams = by_mass(one, 1e-3 * weighed, units) if heavy else ""
+    unit = find_unit_by_mass(one, weighed, units)
+    in_grams = find_unit_by_mass(one, 1e-3 * weighed, units) if heavy else ""
     if in_grams and not unit:
         raise LogError(
             f"--mass {weighed:g} is {weighed:g} kg, but the {thrust} carries"
@@ -301,7 +301,7 @@ def _usual(total: ndarray) -> float:
     return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 
 
-def _driving(log: FlightLog, proposal: MappingProposal) -> str:
+def _find_input(log: FlightLog, proposal: MappingProposal) -> str:
     """The input that the force follows best, "" where that cannot be determined."""
     inputs = [name for name in thrust_checks.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust_checks.follows(log, name)) is not None}
@@ -323,7 +323,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """
-    applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
+    applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_find_input(log, proposal)))
     if applied is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
         return None
     name, (_, total) = applied

@@ -18,7 +18,7 @@ from visthrow.diagnose.inputs.unit_evidence import (
     Attitude,
     PathReading,
     readings,
-    rising,
+    select_rising,
     turn_to,
 )
 from visthrow.logs.check import physics, relations
@@ -121,7 +121,7 @@ class Recognition:
             if len(group.columns) == size and (targets or not group.matches("target"))
         ]
 
-    def _hinting(self, kind: str) -> list[Group]:
+    def _find_hints(self, kind: str) -> list[Group]:
         """Groups of three columns that no channel has and whose names hint at a kind."""
         return [group for group in self._open(3) if group.hints_at(kind)]
 
@@ -221,7 +221,7 @@ class Recognition:
         accelerometer away from up, where it points over a flight.
         """
         attitudes = attitude.samples()
-        groups = self._hinting("acc_b")
+        groups = self._find_hints("acc_b")
         for group in groups:
             force_b = self._samples(group)
             turn = matrix_of_quat(attitudes.attitudes(force_b.time))
@@ -378,7 +378,7 @@ class Recognition:
         ]
 
     def _samples(self, group: Group) -> Samples:
-        return rising(self.time, group.values)
+        return select_rising(self.time, group.values)
 
     def _best(
         self, derived: Samples, groups: list[Group]
@@ -421,7 +421,7 @@ class Recognition:
         time, slope = self._found["pos_w"].channel.samples().derivative(_SPAN)
         attitude = self._found["quat_wb"].channel.samples()
         turned = Samples(time, rotate_back(attitude.attitudes(time), slope))
-        best = self._best(turned, self._hinting("velocity"))
+        best = self._best(turned, self._find_hints("velocity"))
         if best is None:
             return False
         relation, group = best
@@ -435,7 +435,7 @@ class Recognition:
         return self._take("vel_b", group, unit, why)
 
     def _rates(self) -> None:
-        groups = self._hinting("rate_b")
+        groups = self._find_hints("rate_b")
         if not groups:
             return
         derived = Samples(np.empty(0), np.empty((0, 3)))
@@ -461,7 +461,7 @@ class Recognition:
         self._take("rate_b", group, unit, why, axes=self._body())
 
     def _forces(self) -> None:
-        for group in self._hinting("acc_b"):
+        for group in self._find_hints("acc_b"):
             size = np.nanmedian(np.linalg.norm(group.values, axis=1))
             for unit in fitting_units(size / physics.GRAVITY, ("m/s^2", "g", "mg"), 0.8, 1.25):
                 why = f"a middle size of {size:.3g}: gravity in {unit}"

@@ -94,7 +94,7 @@ def load(name: str | Path | None) -> Setup:
     return config.load(Setup, config.find("diagnose", str(name)))
 
 
-def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
+def describe_vehicle(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
     """Return what a setup, or the plant of an experiment, says of the vehicle.
 
     ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the

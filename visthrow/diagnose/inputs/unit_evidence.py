@@ -116,7 +116,7 @@ def readings(
     """
     reach = np.nanmax(np.abs(path))
     in_hall = fitting_units(reach, units, *_HALL)
-    fall = by_fall(time, path)
+    fall = find_unit_by_fall(time, path)
     leans = [_weigh_by_lean(time, path, way) for way in attitudes]
     together = defaultdict(float)  # by kind: angles in whatever unit
     for attitude, lean in zip(attitudes, leans):
@@ -153,7 +153,7 @@ def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
     """Weigh a path against the lean that an attitude gives it."""
     attitudes = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
-    stamps, acc = physics.accelerations(rising(time, turned), "m", _SPAN)
+    stamps, acc = physics.accelerations(select_rising(time, turned), "m", _SPAN)
     if min(len(stamps), len(attitudes.time)) < 50:
         return NO_LEAN
     up = matrix_of_quat(attitudes.attitudes(stamps))[:, :, 2]
@@ -181,11 +181,11 @@ def turn_to(axes: str) -> ndarray:
     return turn_of(axes or OURS).T
 
 
-def by_fall(time: ndarray, path: ndarray) -> str:
+def find_unit_by_fall(time: ndarray, path: ndarray) -> str:
     """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
     level; "" where none does.
     """
-    acc = physics.accelerations(rising(time, path), "m").values
+    acc = physics.accelerations(select_rising(time, path), "m").values
     if not len(acc):
         return ""
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])
@@ -197,7 +197,7 @@ def by_fall(time: ndarray, path: ndarray) -> str:
     return best if shares[best] > _SHARE else ""
 
 
-def by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
+def find_unit_by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
     """Find the unit of a thrust in which it carries what was weighed.
 
     Args:
@@ -213,7 +213,7 @@ def by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
     return unit if miss < MASS_BAD else ""
 
 
-def rising(time: ndarray, path: ndarray) -> Samples:
+def select_rising(time: ndarray, path: ndarray) -> Samples:
     """Rows that are numbers and leave the clock going on."""
     rows = forward_rows(np.where(np.isfinite(path).all(1), time, np.nan))
     return Samples(time[rows], path[rows])

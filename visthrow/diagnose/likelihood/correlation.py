@@ -27,7 +27,7 @@ from scipy.special import expit, logit
 
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG
-from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram, residual_after_fit
+from visthrow.diagnose.likelihood.marginal import correlate_all, hidden_gram, residual_after_fit
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Window
 
@@ -228,6 +228,6 @@ def _likelihood(
     """
     correlated = with_correlations(windows, {**correlations_of, channel: guess})
     grams = parallel_map(partial(hidden_gram, channels=channels), correlated)
-    shaped = correlated_of(grams, correlated, noise.CORRELATION_TIMES[1])
+    shaped = correlate_all(grams, correlated, noise.CORRELATION_TIMES[1])
     levels, value = noise.roughly(shaped, start)
     return value, levels

@@ -280,7 +280,7 @@ class Posterior:
             theta[columns] = np.clip(solution, *bounds)  # the solver exceeds bounds by rounding
         return theta
 
-    def averaged(self, j: int, sets: Sets) -> tuple[float, float]:
+    def average(self, j: int, sets: Sets) -> tuple[float, float]:
         """Return mean and standard deviation of an effect's size, averaged over the possible sets
         that contain it, in floors. Effects outside a set keep their spike priors.
         """
@@ -294,13 +294,13 @@ class Posterior:
         return float(mean), float(np.sqrt(variance))
 
     def mean_sizes(self, active: Indices, sets: Sets) -> ndarray:
-        """Return the means of the selected effects by :meth:`averaged`, clipped to their bounds,
+        """Return the means of the selected effects by :meth:`average`, clipped to their bounds,
         and 0 for all others; in floors, shape (K,).
         """
         theta = np.zeros(len(self.score))
         for j in active:
             homes = [(members, nats) for members, nats in sets if j in members]
-            mean = self.averaged(j, homes)[0]
+            mean = self.average(j, homes)[0]
             theta[j] = np.clip(mean, self.priors.low[j], self.priors.high[j])
         return theta
 

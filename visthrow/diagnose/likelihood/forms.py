@@ -84,7 +84,7 @@ def errors(
     names, row = np.unique(groups, return_inverse=True)
     sums = np.zeros((3, len(names), channels, len(HORIZONS)))
     for window, f, residual in zip(windows, row, residuals):
-        innovation, expected, horizon = predicted(window, noise, residual)
+        innovation, expected, horizon = predict(window, noise, residual)
         ahead = horizon >= 0
         place = window.channel[ahead], horizon[ahead]
         square, count, floor = sums_of = np.zeros((3, channels, len(HORIZONS)))
@@ -96,7 +96,7 @@ def errors(
     return Errors(*sums)
 
 
-def predicted(window: Window, noise: Noise, residual: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+def predict(window: Window, noise: Noise, residual: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Predict the rest of a window from its head.
 
     Returns the prediction error in sigmas, of the residual's shape, the square of it that noise

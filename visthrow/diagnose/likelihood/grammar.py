@@ -18,7 +18,7 @@ FINE = 8  # points between two knots at which a curve is evaluated
 
 
 @lru_cache(maxsize=64)
-def between(count: int) -> ndarray:
+def interpolation_matrix(count: int) -> ndarray:
     """Return the matrix from values at the knots to the coefficients of hat functions that
     approximate the smooth curve through these values best, shape (k, k).
 
@@ -52,7 +52,7 @@ def _hats(window: Window, time: ndarray, block: str) -> ndarray:
     out = np.zeros((len(window.latent_block), len(time), 3))
     rows = np.flatnonzero(window.latent_block == LATENT_BLOCKS.index(block))
     nearest = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)
-    out[rows, :, window.latent_axis[rows].astype(int)] = between(len(time))[nearest]
+    out[rows, :, window.latent_axis[rows].astype(int)] = interpolation_matrix(len(time))[nearest]
     return out.reshape(len(out), -1)
 
 

@@ -34,7 +34,7 @@ class _Shape:
     root: ndarray
     log_det: float  # of V
 
-    def projected(self, gram: Gram) -> ndarray:
+    def project(self, gram: Gram) -> ndarray:
         """Return L^-1 P^1/2 U' W r of a window's residuals, shape (n,)."""
         cross = self.weight @ gram.cross[:, : gram.hidden]
         part = self.root @ (self.level * cross)
@@ -42,11 +42,11 @@ class _Shape:
 
     def square(self, gram: Gram) -> float:
         """Return r' V^-1 r + log det V of a window's residuals."""
-        explained = np.square(self.projected(gram)).sum()
+        explained = np.square(self.project(gram)).sum()
         return self.weight @ gram.square - explained + self.log_det
 
 
-def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]:
+def fit_windows(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]:
     """Fit the initial states and latent forces of windows.
 
     ``noise``: with the shares of these windows. Returns the most probable initial state and
@@ -59,7 +59,7 @@ def fitted(grams: Sequence[Gram], noise: Noise) -> tuple[list[ndarray], ndarray]
     fits = []
     values = []
     for gram, shape in zip(grams, _shapes(grams, noise)):
-        fits.append(shape.level * (shape.root.T @ shape.projected(gram)))
+        fits.append(shape.level * (shape.root.T @ shape.project(gram)))
         values.append(-0.5 * shape.square(gram))
     return fits, np.array(values)
 
@@ -68,7 +68,7 @@ def look(grams: Sequence[Gram], noise: Noise) -> tuple[ndarray, ndarray, ndarray
     """Return the log-likelihood of each window, its gradient and its expected curvature with
     respect to the logarithms of the window's noise levels.
 
-    Raises DiagnoseError: as :func:`fitted`. Returns values (W,); gradients (W, B + C) by the
+    Raises DiagnoseError: as :func:`fit_windows`. Returns values (W,); gradients (W, B + C) by the
     standard deviations of B blocks and the scales of C channels; curvatures (W, B + C, B + C). The
     coupling of scales and fitted columns is divided among the channels by their degrees of
     freedom."""
@@ -129,7 +129,7 @@ def _evaluate(gram: Gram, shape: _Shape) -> tuple[float, ndarray, ndarray]:
     taken = np.clip(shape.weight * spread, 0.0, gram.count)
     in_blocks = np.zeros((BLOCKS, len(variance)))
     in_blocks[gram.latent_block, np.arange(gram.nuisances, gram.hidden)] = 1.0
-    mean = shape.root.T @ shape.projected(gram)
+    mean = shape.root.T @ shape.project(gram)
     moved = shape.level * mean
     bent = inner @ moved @ moved
     square = gram.square - 2.0 * gram.cross[:, : gram.hidden] @ moved + bent + spread
@@ -150,9 +150,9 @@ class Integrals:
     """The part of windows' statistics that does not depend on the residuals."""
 
     def __init__(self, grams: Sequence[Gram], noise: Noise):
-        """Integrate initial states and latent forces out; ``noise``: as in :func:`fitted`.
+        """Integrate initial states and latent forces out; ``noise``: as in :func:`fit_windows`.
 
-        Raises DiagnoseError: as :func:`fitted`, or the information is negative beyond rounding."""
+        Raises DiagnoseError: as :func:`fit_windows`, or the information is negative beyond rounding."""
         self._shapes = _shapes(grams, noise)
         self._halves, of_windows = zip(*parallel_map(_reduce, grams, self._shapes))
         count = max(map(len, of_windows))
@@ -178,7 +178,7 @@ class Integrals:
         score = np.zeros(self._information.shape[:2])
         for row, gram, shape, half in zip(score, grams, self._shapes, self._halves):
             effects = shape.weight @ gram.cross[:, gram.hidden :]
-            row[: len(effects)] = effects - half.T @ shape.projected(gram)
+            row[: len(effects)] = effects - half.T @ shape.project(gram)
         score[:, np.diagonal(self._information.sum(0)) == 0.0] = 0.0
         square = np.array([shape.square(gram) for gram, shape in zip(grams, self._shapes)])
         sizes = np.zeros(score.shape[1])

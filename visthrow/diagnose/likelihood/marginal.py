@@ -121,9 +121,9 @@ class Statistics:
     @cached_property
     def absolute(self) -> "Statistics":
         """Return the statistics at theta = 0."""
-        return self.about(np.zeros(self.score.shape[1]))
+        return self.extrapolate(np.zeros(self.score.shape[1]))
 
-    def about(self, theta: ndarray) -> "Statistics":
+    def extrapolate(self, theta: ndarray) -> "Statistics":
         """Return the statistics extrapolated to other sizes: the same for all rows, shape (K,), or
         those of each row, shape (F, K).
         """
@@ -145,7 +145,7 @@ class Statistics:
         """Return the statistics of some rows; ``keep`` is a mask or indices."""
         return self._with_rows(self.flights[keep], lambda values: values[keep])
 
-    def by(self, groups: Indices) -> "Statistics":
+    def sum_by(self, groups: Indices) -> "Statistics":
         """Add up the rows of each group; ``groups``: the group of each row, shape (F,)."""
         numbers = np.unique(groups)
         members = np.equal.outer(numbers, groups).astype(float)
@@ -172,8 +172,8 @@ def gram_of(window: Window, floors: ndarray, channels: int) -> Gram:
     ``channels``: number C of the model's channels. Raises DiagnoseError: the window's arrays do not
     fit together, or hold NaN or infinity."""
     check(window, len(floors), channels)
-    z = whitened(window, columns(window, floors) / window.sigma[:, None])
-    r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
+    z = whiten(window, columns(window, floors) / window.sigma[:, None])
+    r = whiten(window, (window.residual / window.sigma)[:, None])[:, 0]
     size = z.shape[1]
     inner = np.zeros((channels, size, size))
     cross = np.zeros((channels, size))
@@ -219,7 +219,7 @@ def without_effects(gram: Gram) -> Gram:
     return replace(gram, inner=inner, cross=gram.cross[:, : gram.hidden])
 
 
-def in_one_channel(gram: Gram, scale: ndarray) -> Gram:
+def merge_channels(gram: Gram, scale: ndarray) -> Gram:
     """Return a Gram matrix that has one channel for all samples, weighted by their noise.
 
     ``scale``: of each channel's sigma, shape (C,)."""
@@ -241,7 +241,7 @@ def with_latent_effects(gram: Gram) -> Gram:
     return replace(gram, inner=inner, cross=gram.cross[:, columns])
 
 
-def whitened(window: Window, values: ndarray) -> ndarray:
+def whiten(window: Window, values: ndarray) -> ndarray:
     """Whiten columns in sigmas, shape (N, P), in place, and return them."""
     for rows, factor in window.correlated:
         group = values[rows].reshape(len(rows), -1)
@@ -287,7 +287,7 @@ def finite(window: Window) -> bool:
     return all(np.all(np.isfinite(array)) for array in arrays)
 
 
-def correlated(gram: Gram, window: Window, time: float) -> Gram:
+def correlate(gram: Gram, window: Window, time: float) -> Gram:
     """Correlate the latent forces of a Gram matrix whose ``factor`` is the identity.
 
     ``window``: for the knots; ``time``: correlation time [s]. Latent forces at knots dt apart
@@ -309,7 +309,7 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
 
 def knot_factor(window: Window, time: float) -> ndarray:
     """Return the Cholesky factor of a window's latents of one block and axis; all blocks and axes
-    share it. See :func:`correlated`.
+    share it. See :func:`correlate`.
     """
     knots = np.unique(window.latent_time)
     lag = np.abs(knots[:, None] - knots)
@@ -321,9 +321,9 @@ def grams_of(windows: Sequence[Window], floors: ndarray, channels: int) -> list[
     return parallel_map(partial(gram_of, floors=floors, channels=channels), windows)
 
 
-def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float) -> list[Gram]:
-    """Correlate the latent forces of all windows, see :func:`correlated`."""
-    return parallel_map(partial(correlated, time=time), grams, windows)
+def correlate_all(grams: Sequence[Gram], windows: Sequence[Window], time: float) -> list[Gram]:
+    """Correlate the latent forces of all windows, see :func:`correlate`."""
+    return parallel_map(partial(correlate, time=time), grams, windows)
 
 
 def with_residuals(
@@ -340,7 +340,7 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
     """Return a Gram matrix with another residual and the same derivatives."""
     count = len(residual)
     channels = len(gram.count)
-    white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
+    white = whiten(window, (residual / window.sigma)[:, None])[:, 0]
     weighted = np.zeros((channels, count))
     weighted[window.channel, np.arange(count)] = _unwhiten(window, white) / window.sigma
     by_state = weighted @ window.nuisance * window.nuisance_sd
@@ -353,7 +353,7 @@ def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray
 
 
 def _unwhiten(window: Window, white: ndarray) -> ndarray:
-    """Apply the transpose of :func:`whitened` to one column, shape (N,)."""
+    """Apply the transpose of :func:`whiten` to one column, shape (N,)."""
     out = white.copy()
     for rows, factor in window.correlated:
         out[rows] = lapack.dtrtrs(factor, white[rows], lower=1, trans=1)[0]

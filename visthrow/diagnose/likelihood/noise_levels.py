@@ -13,12 +13,12 @@ from functools import partial
 import numpy as np
 from numpy import ndarray
 
-from visthrow.diagnose.likelihood.integrals import fitted, look
+from visthrow.diagnose.likelihood.integrals import fit_windows, look
 from visthrow.diagnose.likelihood.marginal import (
     TAIL,
     Gram,
     Noise,
-    correlated_of,
+    correlate_all,
     hidden_gram,
     residual_after_fit,
     without_effects,
@@ -82,8 +82,8 @@ def fit(
     if start is None and any(gram.latents for gram in grams):
         start = _likeliest(windows, grams)
     time = CORRELATION_TIMES[0] if start is None else start.correlation_time
-    shaped = correlated_of(grams, windows, time)
-    return maximised(shaped, start or _guess(shaped))[0], shaped
+    shaped = correlate_all(grams, windows, time)
+    return maximise(shaped, start or _guess(shaped))[0], shaped
 
 
 def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
@@ -96,9 +96,9 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram]) -> Noise:
 
     def likely(i: int, noise: Noise | None) -> float:
         if i not in levels_of:
-            shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
+            shaped = correlate_all(bare, windows, CORRELATION_TIMES[i])
             begin = replace(noise or _guess(shaped), correlation_time=CORRELATION_TIMES[i])
-            levels_of[i] = maximised(shaped, begin, ROUGHLY_NATS)
+            levels_of[i] = maximise(shaped, begin, ROUGHLY_NATS)
         return levels_of[i][1]
 
     best = len(CORRELATION_TIMES) // 2
@@ -126,7 +126,7 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     levels of similar grams, from which the search starts.
     """
     guess = only(start, grams, range(len(grams))) if start else _guess(grams)
-    return maximised(grams, guess, ROUGHLY_NATS)
+    return maximise(grams, guess, ROUGHLY_NATS)
 
 
 def _guess(grams: Sequence[Gram]) -> Noise:
@@ -205,7 +205,7 @@ class _Layout:
         return tuple(limits)
 
 
-def maximised(
+def maximise(
     grams: Sequence[Gram], noise: Noise, tolerance: float = ENOUGH_NATS
 ) -> tuple[Noise, float]:
     """Maximise the posterior probability of all levels' logarithms within their limits, by Fisher
@@ -334,14 +334,14 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram]) -> list[ndarr
     latents.
     """
     time = CORRELATION_TIMES[0]
-    shaped = correlated_of(bare, windows, time)
+    shaped = correlate_all(bare, windows, time)
     share = np.zeros((len(bare), len(LATENT_BLOCKS)))
     for row, gram in zip(share, bare):
         for (block, _), level in _guess([gram]).latent_sd.items():
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
-    fits, _ = fitted(shaped, noise)
+    fits, _ = fit_windows(shaped, noise)
     for fit, gram in zip(fits, shaped):
         latents = fit[gram.nuisances :]
         fit[gram.nuisances :] = gram.factor @ latents

@@ -94,7 +94,7 @@ class BallModel(NumericModel):
             air = vel - wind
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
             acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[index]
-            return np.concatenate([vel, acc + self.exerted("payload force", state)], 1)
+            return np.concatenate([vel, acc + self.exert("payload force", state)], 1)
 
         step = self.of_windows(lanes, "span")[:, None] / STEPS * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance, STEPS, step)

@@ -143,7 +143,7 @@ def term_of(law: LawParams) -> Term:
     return Term(law.block, law.factors, law.vector)
 
 
-def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, ndarray]:
+def exert(laws: Sequence[LawParams], values: Knots) -> dict[str, ndarray]:
     """Return the forces and torques of laws in each latent block at states with these quantities,
     shape (k, 3); empty without laws.
     """

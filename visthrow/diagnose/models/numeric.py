@@ -17,7 +17,7 @@ from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import Term, carries, term_of
-from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
+from visthrow.diagnose.models.law_terms import exert as exert  # for users' models
 from visthrow.diagnose.models.model_interface import Indices, Linearised, Model, Sizes, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -256,11 +256,11 @@ class NumericModel(Model, ABC):
         """
         return {}
 
-    def exerted(self, block: str, state: ndarray) -> ndarray:
+    def exert(self, block: str, state: ndarray) -> ndarray:
         """Return the force or torque of the model's laws on a latent block, shape (B, 3)."""
         if not self.laws:
             return np.zeros((len(state), 3))
-        return exerted(self.laws, self.quantities(np.zeros(len(state)), state))[block]
+        return exert(self.laws, self.quantities(np.zeros(len(state)), state))[block]
 
     def size(self, theta: Sizes) -> ndarray:
         """Return the total sizes of all effects in order, shape (K,).
@@ -333,7 +333,7 @@ class NumericModel(Model, ABC):
         latent = np.zeros((count, len(self.stretches[0].latent_block)))
         return Lanes(np.arange(count), np.tile(size, (count, 1)), start, latent)
 
-    def _measured(self, lanes: Lanes) -> list[ndarray]:
+    def _simulate_measurements(self, lanes: Lanes) -> list[ndarray]:
         """Simulate the measurements of lanes, shape (L, N) for each stretch; all stretches have the
         same number L of lanes, one stretch after the other.
         """
@@ -350,7 +350,7 @@ class NumericModel(Model, ABC):
 
     def _off(self, size: ndarray, start: ndarray) -> list[ndarray]:
         """Return the residuals of all stretches from given initial states, shape (N,) each."""
-        measured = self._measured(self._lanes(size, start))
+        measured = self._simulate_measurements(self._lanes(size, start))
         return [s.residual - only for s, (only,) in zip(self.stretches, measured)]
 
     def _settle(self, size: ndarray) -> list[ndarray]:
@@ -428,8 +428,8 @@ class NumericModel(Model, ABC):
         moves = np.concatenate([step[:, None] * axes for step in steps])
         lanes = lanes.part(np.repeat(lanes.owner, count))
         middle = getattr(lanes, name)
-        above = self._measured(replace(lanes, **{name: middle + moves}))
-        below = self._measured(replace(lanes, **{name: middle - moves}))
+        above = self._simulate_measurements(replace(lanes, **{name: middle + moves}))
+        below = self._simulate_measurements(replace(lanes, **{name: middle - moves}))
         slopes = []
         for higher, lower, step in zip(above, below, steps):
             slopes.append((0.5 * (higher - lower)).T / step)

@@ -143,7 +143,7 @@ def sweep(
     return limit(frequency) * fade * np.sin(turned + phase)
 
 
-def _between(range_hz: tuple[float, float], share: float) -> float:
+def _interpolate_frequency(range_hz: tuple[float, float], share: float) -> float:
     """Return the frequency at a share of a logarithmic range [Hz]."""
     low, high = range_hz
     return low * (high / low) ** share
@@ -165,7 +165,7 @@ frequency.
 START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the unchanged manoeuvre
 
 
-def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
+def design(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
     """Add the sweeps of a vector of :data:`NUMBERS` to a manoeuvre."""
     x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0)))
     kept = x["kept"]
@@ -175,7 +175,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
     half_height = 0.5 * (limits.highest - limits.lowest)
     reaches = dict(zip("xyz", (*limits.half, half_height)))
 
-    def swept(axis: str) -> ndarray:
+    def sweep_axis(axis: str) -> ndarray:
         def farthest(frequency: ndarray) -> ndarray:
             turned = 2.0 * np.pi * frequency
             if axis == "yaw":
@@ -183,15 +183,15 @@ def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
             within = np.minimum(reaches[axis], limits.speed / turned)
             return np.minimum(within, limits.acceleration / turned**2)
 
-        low = _between(PATH, x[f"from_{axis}"])
-        high = _between(PATH, x[f"to_{axis}"])
+        low = _interpolate_frequency(PATH, x[f"from_{axis}"])
+        high = _interpolate_frequency(PATH, x[f"to_{axis}"])
         return x[f"share_{axis}"] * sweep(t, seconds, low, high, farthest)
 
     middle = np.array([0.0, 0.0, base.pos_w[0, 2]])
     ramped = middle + kept * (base.pos_w - middle)
-    moved = np.column_stack([swept(axis) for axis in "xyz"])
+    moved = np.column_stack([sweep_axis(axis) for axis in "xyz"])
     slow = ADDED[0]
-    fast = _between(ADDED, x["added_to"])
+    fast = _interpolate_frequency(ADDED, x["added_to"])
     rates_b = kept * base.rates_b
     for i, axis in enumerate("xyz"):
         added = sweep(t, seconds, slow, fast, phase=2.0 * np.pi * i / 3.0)
@@ -202,7 +202,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: ndarray) -> Manoeuvre:
         name=base.name + OPTIMISED,
         purpose="the most nats a second within the limits",
         pos_w=ramped + limits.share(ramped, moved) * moved,
-        yaw=kept * base.yaw + swept("yaw"),
+        yaw=kept * base.yaw + sweep_axis("yaw"),
         rates_b=rates_b,
         thrust_factor=1.0 + kept * (base.thrust_factor - 1.0) + thrust,
     )
@@ -267,7 +267,7 @@ def optimise(
         return min(tried, key=lambda trial: trial[0])
 
     def costs(columns: ndarray) -> ndarray:
-        simulated = simulate([designed(base, limits, x) for x in columns.T])
+        simulated = simulate([design(base, limits, x) for x in columns.T])
         tried.extend(_judge(aim, flight, base.seconds) for flight in simulated)
         cost, information = best()
         flown = information is not None
@@ -291,5 +291,5 @@ def optimise(
     cost, information = best()
     if information is None:
         return None
-    manoeuvre = designed(base, limits, found.x)
+    manoeuvre = design(base, limits, found.x)
     return Design(base, manoeuvre, found.x, information, -cost, -tried[0][0], len(tried))

@@ -89,7 +89,7 @@ def simulator_of(
         adapted = copy
     elif isinstance(model, FlyerModel):
         plant = vehicle_of(model.params, plant_of(load_experiment("state")))
-        adapted = partial(carried, params=model.params)
+        adapted = partial(adapt_to_payload, params=model.params)
     else:
         raise DiagnoseError(
             "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
@@ -104,7 +104,7 @@ def simulator_of(
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
         flights = fly(plant, manoeuvres, seed, model.device)
-        return [flight.simulated(model_of) for flight in flights]
+        return [flight.simulate(model_of) for flight in flights]
 
     return simulate, adapted
 
@@ -134,7 +134,7 @@ def _throw_model(
     )
 
 
-def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
+def adapt_to_payload(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
     """Return the manoeuvre with the payload of a setup's vehicle, or without; None if the vehicle
     would have to drop its payload.
     """
@@ -201,7 +201,7 @@ class SimulatedFlight:
         """Return the times of the samples [s]."""
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
-    def simulated(self, model_of: Callable[["SimulatedFlight"], Model]) -> Simulated:
+    def simulate(self, model_of: Callable[["SimulatedFlight"], Model]) -> Simulated:
         """Return the model that ``model_of`` makes of the flight, None if the flight is aborted or
         cannot be replayed; and the share of the limits that it used.
         """

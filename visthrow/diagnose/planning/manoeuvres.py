@@ -172,7 +172,7 @@ SHAPES: dict[str, Callable[[ndarray], ndarray]] = {
 """Shapes that the table of manoeuvres refers to by name."""
 
 
-def _along(shape: Any, t: ndarray) -> ndarray:
+def _evaluate_shape(shape: Any, t: ndarray) -> ndarray:
     """Return the values of a shape at times [s].
 
     ``shape``: a name of :data:`SHAPES`; a constant; or a start value and rises, each with its size,
@@ -204,14 +204,14 @@ def _manoeuvre(
     """Make a manoeuvre from a row of the table, whose shapes :func:`_along` reads."""
     time = times_of(seconds)
     t = moving_times(seconds)
-    pos_w = np.column_stack([_along(axis, t) for axis in (x, y, z)])
-    factor = _along(thrust, t)
+    pos_w = np.column_stack([_evaluate_shape(axis, t) for axis in (x, y, z)])
+    factor = _evaluate_shape(thrust, t)
     added = SHAPES[rates](t) if rates else np.zeros((len(t), 3))
     moving = (time > SETTLE) & (time < seconds - SETTLE)
     factor[~moving] = 1.0
     added[~moving] = 0.0
     released = time - SETTLE >= release
-    heading = _along(yaw, t)
+    heading = _evaluate_shape(yaw, t)
     return Manoeuvre(name, purpose, seconds, pos_w, heading, added, factor, released, payload)
 
 
@@ -220,7 +220,7 @@ def catalogue() -> tuple[Manoeuvre, ...]:
     return tuple(_manoeuvre(name, **row) for name, row in tables_beside(__file__).items())
 
 
-def named(names: Iterable[str]) -> list[Manoeuvre]:
+def select_manoeuvres(names: Iterable[str]) -> list[Manoeuvre]:
     """Return the manoeuvres of these names, in the order of the names.
 
     Raises DiagnoseError: the catalogue has no manoeuvre of a name.

@@ -17,7 +17,7 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
 from visthrow.diagnose.likelihood.evidence import FEWEST, STRONG, Posterior
 from visthrow.diagnose.likelihood.integrals import Integrals
-from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
+from visthrow.diagnose.likelihood.marginal import Noise, correlate_all, grams_of
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
@@ -94,7 +94,7 @@ class PlanningGoal:
         floors = np.array([e.floor for e in model.effects])
         channels = len(model.channels)
         grams = grams_of(windows, floors, channels)
-        grams = correlated_of(grams, windows, noise.correlation_time)
+        grams = correlate_all(grams, windows, noise.correlation_time)
         expected = replace(
             noise,
             scale=np.ones(channels),
@@ -116,20 +116,20 @@ class PlanningGoal:
             return min(self._gap(pair, new) for pair in self.pairs)
         return np.log(self._deviations(0.0 * new) / self._deviations(new)).mean()
 
-    def settled(self, new: ndarray) -> tuple[list[tuple[int, ...]], int]:
+    def settle(self, new: ndarray) -> tuple[list[tuple[int, ...]], int]:
         """Return the pairs separated, or the effects measured well enough, by the fewest flights
         that settle most of them; and the number of these flights.
         """
         most = []
         repeats = 0
         for count in range(1, MOST_REPEATS + 1):
-            settled = self._settled_by(new, count)
+            settled = self._settle_by(new, count)
             if len(settled) > len(most):
                 most = settled
                 repeats = count
         return most, repeats
 
-    def _settled_by(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
+    def _settle_by(self, new: ndarray, count: int) -> list[tuple[int, ...]]:
         """Return the pairs that ``count`` flights separate, or the effects that they measure well
         enough to select.
         """
@@ -193,7 +193,7 @@ class PlanningGoal:
 
     def proposal(self, flight: Manoeuvre | Measurement, new: ndarray) -> FlightProposal:
         """Return the proposal of a manoeuvre or a measurement with this information."""
-        separated, repeats = self.settled(new)
+        separated, repeats = self.settle(new)
         separates = [tuple(self.names[j] for j in group) for group in separated]
         return FlightProposal(
             flight.name,

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.planning.fly_manoeuvres import fly
     from visthrow.task import load_experiment, plant_of
 
-    chosen = manoeuvres.named(dict.fromkeys(args.manoeuvres))
+    chosen = manoeuvres.select_manoeuvres(dict.fromkeys(args.manoeuvres))
     plant = plant_of(load_experiment(args.plant, args.overrides))
     folder = Path(args.out)
     writable(folder)

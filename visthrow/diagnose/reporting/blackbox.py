@@ -127,7 +127,7 @@ def train(
     return Trained(statistics.about(sizes).by(groups), reach)
 
 
-def unexplained(point: Point, seed: int) -> dict | None:
+def tabulate_unexplained(point: Point, seed: int) -> dict | None:
     """Return a table of the residual forces at a point, for JSON; None if none can be trained.
 
     Force in body axes = weights times (1, inputs, radial functions of the inputs), with inputs in

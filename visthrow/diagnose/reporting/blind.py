@@ -71,7 +71,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             return small + rng.standard_normal(shape) @ root.T
         return small + rng.choice((-1.0, 1.0), (draws, len(score_of))) @ score_of
 
-    def named(score: ndarray) -> tuple[ndarray, ndarray]:
+    def find_named(score: ndarray) -> tuple[ndarray, ndarray]:
         gain = Posterior(information, score, priors).additions(())
         return gain, gain.max(axis=1) > diagnosis.threshold
 
@@ -83,7 +83,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             if not hidden:
                 break
             score = np.vstack([worlds() + s * information[j] for s in hidden])
-            gain, named_effect = named(score)
+            gain, named_effect = find_named(score)
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
             hits = [np.mean(named_effect & answer) for answer in (best, close, ~close)]
@@ -92,7 +92,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
         limit = _limit(size, similar) * effect.floor if rows else np.nan
         shares = size * effect.floor, exact, similar, wrong
         curves.append(Completeness(effect.name, effect.unit, *shares, limit))
-    _, alarms = named(np.vstack([worlds() for _ in range(10)]))
+    _, alarms = find_named(np.vstack([worlds() for _ in range(10)]))
     source = "residuals of the flights, with a random sign for each flight"
     if parametric:
         source = "drawn from its fitted level"

@@ -12,13 +12,13 @@ add_arguments = declare(__file__)
 def run(args: argparse.Namespace) -> int:
     """Read the logs, check them, print and draw the results."""
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.inputs.setup import known, read_logs
+    from visthrow.diagnose.inputs.setup import describe_vehicle, read_logs
     from visthrow.diagnose.reporting.log_picture import draw
     from visthrow.logs.check.run import check, table
 
     # of the models, only the flyer states a cable and a mass to check
     logs = read_logs(args.logs, args.config, models=("flyer",))
-    results = check(logs, known(args.config, args.plant))
+    results = check(logs, describe_vehicle(args.config, args.plant))
     for number, (log, checked) in enumerate(zip(logs, results), start=1):
         print(table(checked, args.all) + "\n")
         if not args.no_pictures:

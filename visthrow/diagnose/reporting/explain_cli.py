@@ -13,7 +13,7 @@ from visthrow.diagnose.likelihood.forms import readable, unit_of
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.reporting import blackbox, blind, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
-from visthrow.diagnose.select.diagnose_flights import refused_of
+from visthrow.diagnose.select.diagnose_flights import find_refused
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, UNKNOWN, Diagnosis
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import FlightLog
@@ -32,7 +32,7 @@ add_arguments = declare(opening.__file__, __file__)
 def run(args: argparse.Namespace) -> int:
     """Diagnose the flights, print the summary, and write the report."""
     folder = Path(args.out)
-    made_with = opening.made_with(args)
+    made_with = opening.describe_origin(args)
     check_place(folder / DIAGNOSIS)
     opened = opening.Opened(args)
     test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
@@ -73,8 +73,8 @@ def _test(
     before = after.plain()
     if diagnosis.explanations:
         after = after.with_laws(diagnosis.explanations[0])
-    refused = refused_of(checked, test_flights.known)
-    tested = gain.on_others(before, after, diagnosis.expected, diagnosis, refused)
+    refused = find_refused(checked, test_flights.known)
+    tested = gain.evaluate_on_others(before, after, diagnosis.expected, diagnosis, refused)
     print(
         f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
         f"flights;"
@@ -119,7 +119,7 @@ def write_report(
     source = {"logs": len(logs)} | {key: origin[key] for key in ("command", "commit", "time")}
     table = None
     if diagnosis.overall == UNKNOWN:
-        table = blackbox.unexplained(diagnosis.work.after, seed)
+        table = blackbox.tabulate_unexplained(diagnosis.work.after, seed)
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / DIAGNOSIS, whole)  # first, because a full disk may prevent the pictures

@@ -12,12 +12,12 @@ from numpy import ndarray
 
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
-from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
+from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predict
 from visthrow.diagnose.likelihood.marginal import Noise, finite, grams_of
 from visthrow.diagnose.likelihood.noise_levels import without_outliers
 from visthrow.diagnose.models.model_interface import Indices, Model, Sizes, Window
 from visthrow.diagnose.reporting.blackbox import table_of, train
-from visthrow.diagnose.select.held_out import Crossed, Work, channel_gains, crossed
+from visthrow.diagnose.select.held_out import Crossed, Work, channel_gains, cross_validate
 from visthrow.diagnose.select.point import Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 
@@ -69,7 +69,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; ``seed``: of the
     black box's basis."""
     work = diagnosis.work
-    cross = crossed(diagnosis)
+    cross = cross_validate(diagnosis)
     box = _blackbox(work, cross, np.random.default_rng(seed))
     gains = channel_gains(work, cross.groups, cross.trained, box)
     trained = {}
@@ -138,7 +138,7 @@ class Tested:
     outliers: int  # samples that get less weight, as in the fit
 
 
-def on_others(
+def evaluate_on_others(
     before: Model,
     after: Model,
     theta: Sizes,
@@ -184,7 +184,7 @@ def _sum_weighted_squares(
     floors = problem.priors.floor[: windows[0].effects.shape[1]] if windows else np.empty(0)
     mended = without_outliers(correlated, grams_of(correlated, floors, count))
     for plain, window in zip(correlated, mended):
-        innovation, expected, horizon = predicted(window, noise, window.residual)
+        innovation, expected, horizon = predict(window, noise, window.residual)
         weight = (plain.sigma / window.sigma) ** 2
         outliers += (weight < 1.0).sum()
         squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2

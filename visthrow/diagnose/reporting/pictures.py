@@ -57,7 +57,7 @@ def _name_rows(axis, names: Sequence[str], size: float) -> None:
     axis.set_ylim(-1, len(names))
 
 
-def left_over(window: Window, noise: Noise) -> np.ndarray:
+def compute_residuals(window: Window, noise: Noise) -> np.ndarray:
     """Return the residuals after fitting the initial state to the whole window, in the channels'
     units, shape (N,).
     """
@@ -68,7 +68,7 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
     return window.residual - window.nuisance * window.nuisance_sd @ fitted
 
 
-def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) -> bytes:
+def draw_plan(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) -> bytes:
     """Draw an optimised manoeuvre over its base manoeuvre, and the best manoeuvres' expected gain.
 
     ``rates``: manoeuvre -> expected nats a second.
@@ -99,7 +99,7 @@ def residuals(work: Work, channel: int) -> bytes:
     for before, after in zip(work.before.windows, work.after.windows):
         rows = before.channel == channel
         if rows.any():
-            old, new = (left_over(w, work.after.noise)[rows] for w in (before, after))
+            old, new = (compute_residuals(w, work.after.noise)[rows] for w in (before, after))
             pairs.append(((old**2).mean() - (new**2).mean(), before, rows, old, new))
     pairs.sort(key=lambda pair: -pair[0])
     usual = pairs[len(pairs) // 2]

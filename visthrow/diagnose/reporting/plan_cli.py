@@ -21,13 +21,13 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.planning import design, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
-    from visthrow.diagnose.planning.manoeuvres import catalogue, named
+    from visthrow.diagnose.planning.manoeuvres import catalogue, select_manoeuvres
     from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.reporting import pictures
 
     check_place(Path(args.out) / "plan.json")
     limits = _limits(args)
-    chosen = named(args.manoeuvres) if args.manoeuvres else catalogue()
+    chosen = select_manoeuvres(args.manoeuvres) if args.manoeuvres else catalogue()
     opened = opening.Opened(args)
     diagnosis = opened.diagnose(laws=False)
     print(report.summary(diagnosis) + "\n")
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if designed:
         informed.append((designed.manoeuvre, designed.information))
         rates = {m.name: aim.nats(information) / m.seconds for m, information in informed}
-        picture = pictures.planned(designed.base, designed.manoeuvre, rates)
+        picture = pictures.draw_plan(designed.base, designed.manoeuvre, rates)
         atomic_write(Path(args.out) / "plan.png", picture)
     ranked = plan.propose(aim, informed)
     for manoeuvre, _ in informed:

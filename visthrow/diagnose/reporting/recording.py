@@ -10,7 +10,7 @@ import rerun as rr
 from numpy import ndarray
 
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.reporting.pictures import left_over
+from visthrow.diagnose.reporting.pictures import compute_residuals
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import style
@@ -45,7 +45,7 @@ def _channel(
     if not width or len(rows) % width:
         return
     stamps = time[::width]
-    old, new = (left_over(w, noise)[rows].reshape(-1, width) for w in (before, after))
+    old, new = (compute_residuals(w, noise)[rows].reshape(-1, width) for w in (before, after))
     home = f"flight_{before.flight:02d}"
     for values, label, colour in ((old, "before", style.BEFORE), (new, "after", style.AFTER)):
         entity = f"{home}/residual/{name}/{label}"

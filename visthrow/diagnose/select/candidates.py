@@ -6,7 +6,7 @@ candidates is its log marginal likelihood minus the penalties of its members.
 
 A random share is the deviation of an effect's size in one flight, or on one day, from the size that
 all flights have in common. It is normal with standard deviation theta and is integrated out of the
-statistics (:func:`freed`). A flight far from the others is simulated again at other sizes, because
+statistics (:func:`integrate_shares`). A flight far from the others is simulated again at other sizes, because
 the derivative is inexact that far away: it doubles the size of a release that is 40 ms early.
 
 Source: Laird and Ware 1982 (random effects).
@@ -69,7 +69,7 @@ rows, or one for each, shape (F,).
 """
 
 
-def shared(effects: Sequence[Effect]) -> list[Candidate]:
+def list_shared(effects: Sequence[Effect]) -> list[Candidate]:
     """Return a candidate for every effect, with one size in all flights."""
     offered = []
     for j, e in enumerate(effects):
@@ -209,7 +209,7 @@ class Scatter(RandomEffect):
         return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
 
 
-def relinearised_per_flight(
+def relinearise_per_flight(
     statistics: Statistics,
     theta: ndarray,
     priors: Priors,
@@ -223,7 +223,7 @@ def relinearised_per_flight(
     floors, or returns None if that fails.
     """
     information = statistics.information[:, j, j]
-    misfit = statistics.about(theta).score[:, j]
+    misfit = statistics.extrapolate(theta).score[:, j]
     flown = np.flatnonzero(information > 0.0)
     reach = np.abs(misfit[flown] / information[flown]).max(initial=0.0)
     if INEXACT * reach < 1.0:  # the derivative's error is below a floor
@@ -274,7 +274,7 @@ def over_deviations(
     return mode, tuple(size[ends].tolist()), float(np.log(total) + best)
 
 
-def judged(
+def judge(
     v: RandomEffect,
     reach: ndarray,
     nats: ndarray,
@@ -305,7 +305,7 @@ def judged(
     )
 
 
-def allowed(size: float) -> float:
+def find_tolerance(size: float) -> float:
     """Return the standard deviation between flights that is tolerated: a floor and a part of the
     effect's size, in floors.
     """
@@ -316,7 +316,7 @@ def between_flights(
     statistics: Statistics, priors: Priors, active: Indices, theta: ndarray
 ) -> tuple[float, ndarray]:
     """Estimate the variance of selected effects between flights, relative to that which is
-    :func:`allowed`; return it and the part of it that remains in the mean of these flights, shape
+    :func:`find_tolerance`; return it and the part of it that remains in the mean of these flights, shape
     (K,).
 
     Each flight may have a share of each selected effect, with a standard deviation of u times the
@@ -328,10 +328,10 @@ def between_flights(
     """
     information = statistics.information.diagonal(axis1=1, axis2=2)
     share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F for F equal flights
-    sd = {j: allowed(theta[j]) for j in active}
+    sd = {j: find_tolerance(theta[j]) for j in active}
     nats = []
     for u in REACH:
-        unlike = integrated(statistics, [(j, u * size) for j, size in sd.items()])
+        unlike = integrate(statistics, [(j, u * size) for j, size in sd.items()])
         nats.append(evidence_of(unlike, priors, active))
     value = np.array(nats) - max(nats)
     weight = REACH * np.exp(value - 0.5 * REACH**2)  # steps of u grow with u
@@ -345,18 +345,18 @@ def evidence_of(statistics: Statistics, priors: Priors, named: Indices) -> float
     return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square
 
 
-def freed(statistics: Statistics, shares: Shares) -> Statistics:
+def integrate_shares(statistics: Statistics, shares: Shares) -> Statistics:
     """Integrate the random shares out of the statistics.
 
     The rows of the result are days if days have shares, else flights."""
-    of_flights = integrated(statistics, _of_rows(shares, statistics.flights))
-    if not drifting(shares):
+    of_flights = integrate(statistics, _of_rows(shares, statistics.flights))
+    if not find_day_shares(shares):
         return of_flights
-    of_days = of_flights.by(statistics.days)
-    return integrated(of_days, _of_rows(shares, of_days.flights, DAY))
+    of_days = of_flights.sum_by(statistics.days)
+    return integrate(of_days, _of_rows(shares, of_days.flights, DAY))
 
 
-def drifting(shares: Shares) -> Shares:
+def find_day_shares(shares: Shares) -> Shares:
     """Return the random shares of days."""
     return {c: size for c, size in shares.items() if c.group == DAY}
 
@@ -372,7 +372,7 @@ def _of_rows(shares: Shares, numbers: ndarray, group: str = FLIGHT) -> Deviation
                 yield j, size * deviation * has_share
 
 
-def integrated(statistics: Statistics, deviations: Deviations) -> Statistics:
+def integrate(statistics: Statistics, deviations: Deviations) -> Statistics:
     """Integrate out each row's shares of some effects."""
     columns, root, part, precision = _unit_shares(statistics, deviations)
     if not columns:
@@ -411,8 +411,8 @@ def estimate_shares(statistics: Statistics, theta: ndarray, shares: Shares) -> n
     flights from the remainder."""
     sizes = np.zeros(statistics.score.shape)
     of_flights = list(_of_rows(shares, statistics.flights))
-    if drifting(shares):
-        of_days = integrated(statistics, of_flights).by(statistics.days)
+    if find_day_shares(shares):
+        of_days = integrate(statistics, of_flights).sum_by(statistics.days)
         row = np.searchsorted(of_days.flights, statistics.days)
         sizes += _shares(of_days, theta, _of_rows(shares, of_days.flights, DAY))[row]
     return sizes + _shares(statistics, theta + sizes, of_flights)
@@ -421,6 +421,6 @@ def estimate_shares(statistics: Statistics, theta: ndarray, shares: Shares) -> n
 def _shares(statistics: Statistics, theta: ndarray, deviations: Deviations) -> ndarray:
     """Return the most probable shares of each row, shape (F, K), given the sizes ``theta``."""
     columns, root, _, precision = _unit_shares(statistics, deviations)
-    off = root * statistics.about(theta).score[:, columns]
+    off = root * statistics.extrapolate(theta).score[:, columns]
     sizes = root * np.linalg.solve(precision, off[..., None])[..., 0]
     return sizes @ np.eye(len(statistics.theta))[columns]

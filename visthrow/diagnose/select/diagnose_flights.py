@@ -19,13 +19,13 @@ from visthrow.diagnose.select.point import (
     Point,
     Problem,
     linearise,
-    moved,
+    move,
     only,
     untracked_windows,
 )
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
 from visthrow.diagnose.select.selection import Selector
-from visthrow.diagnose.select.verdicts import conclude, out_of_domain
+from visthrow.diagnose.select.verdicts import conclude, report_out_of_domain
 from visthrow.diagnose.throw import command_mistakes as interface
 from visthrow.diagnose.throw.command_mistakes import Mistake
 from visthrow.logs.check.rows import NOTHING as UNKNOWN_VEHICLE
@@ -60,7 +60,7 @@ def diagnose(
     no window or invalid ones."""
     say = progress or (lambda _: None)
     checked = check(flights, vehicle)
-    refused = refused_of(checked, vehicle)
+    refused = find_refused(checked, vehicle)
     reasons = contradictions(checked, vehicle.unread)
     unread = [text for text in contradictions(checked) if text not in reasons]
     if 2 * len(refused) > len(flights):
@@ -94,7 +94,7 @@ def diagnose(
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
 
 
-def refused_of(
+def find_refused(
     checked: Sequence[Checked], vehicle: KnownVehicle = UNKNOWN_VEHICLE
 ) -> tuple[int, ...]:
     """Return the indices of logs in which channels that the model reads contradict each other."""
@@ -121,7 +121,7 @@ def explain(
     considered = [i for i, w in enumerate(windows) if w.flight not in without]
     usable = tuple(i for i in considered if simulated[i])
     if 2 * len(usable) < len(considered) or not usable:
-        return out_of_domain(model, windows, sum(simulated), seed)
+        return report_out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, usable)
     for c, correlation in problem.correlated.items():
         say(
@@ -130,7 +130,7 @@ def explain(
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     selection, commands = _search(nominal, seed, say, laws)
-    diagnosis = held_out.judged(conclude(selection, commands))
+    diagnosis = held_out.judge(conclude(selection, commands))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(selection.nominal.windows)
     if left_out:
@@ -173,7 +173,7 @@ def _find_unfollowed(selection: Selector) -> list[int]:
     untracked = untracked_windows(point)
     if untracked or np.abs(theta - point.theta).max() <= SMALL_STEP:
         return untracked
-    leads = moved(point, theta)
+    leads = move(point, theta)
     return untracked_windows(leads) if leads else []
 
 
@@ -211,20 +211,20 @@ def correct_interface_mistakes(
     ``plant``: plant for which the commands are; ``build``: makes a model of logs. Returns the
     model, which lists the corrections as its ``mistakes``, and its logs.
     """
-    corrected, certain = interface.commanded(logs, plant)
-    suspected_mistakes = interface.suspected(corrected, plant)
+    corrected, certain = interface.derive_commands(logs, plant)
+    suspected_mistakes = interface.suspect(corrected, plant)
 
-    def built(mistakes: Sequence[Mistake]) -> tuple[Model, list[FlightLog]]:
+    def build_corrected(mistakes: Sequence[Mistake]) -> tuple[Model, list[FlightLog]]:
         mended = list(corrected)
         for mistake in mistakes:
-            mended = [mistake.mended(log) for log in mended]
+            mended = [mistake.mend(log) for log in mended]
         return build(mended), mended
 
-    current = built(suspected_mistakes)
+    current = build_corrected(suspected_mistakes)
     for mistake in list(suspected_mistakes):
         remaining = [k for k in suspected_mistakes if k is not mistake]
         try:
-            alternative = built(remaining)
+            alternative = build_corrected(remaining)
         except DiagnoseError:  # no flight can be replayed without this correction
             continue
         nats = log_bayes_factor(current[0], alternative[0])

@@ -12,7 +12,7 @@ from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import unit_of
-from visthrow.diagnose.likelihood.integrals import fitted
+from visthrow.diagnose.likelihood.integrals import fit_windows
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices, Window
@@ -102,7 +102,7 @@ def _likelihood(point: Point, key: tuple[int, str], level: float) -> float:
     noise = point.noise
     latent_sd = {**noise.latent_sd, key: level}
     tried = replace(noise, latent_sd=latent_sd, share=noise.share[windows])
-    return fitted([point.grams[w] for w in windows], tried)[1].sum()
+    return fit_windows([point.grams[w] for w in windows], tried)[1].sum()
 
 
 def _upper_limit(point: Point, key: tuple[int, str]) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from visthrow.diagnose.likelihood.evidence import MODEL_ERROR_FLOOR, NORMAL_95, POSSIBLE, Sets
 from visthrow.diagnose.models.model_interface import Effect, Indices
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.candidates import allowed, unit_suffix
+from visthrow.diagnose.select.candidates import find_tolerance, unit_suffix
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Finding
 
@@ -66,14 +66,14 @@ class Reading:
         remaining = [k for k in together if k != j]
         homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
-        mean, sd = point.posterior.averaged(j, homes)
+        mean, sd = point.posterior.average(j, homes)
         deviation = float(np.hypot(sd, MODEL_ERROR_FLOOR)) * effect.floor
         nats = point.evidence([*remaining, j]) - point.evidence(remaining)
         finding = replace(blank(effect), sd=deviation, nats=nats)
         if j in self.active or partners:
-            differs = float(np.sqrt(self.unlike)) * allowed(mean) * effect.floor
+            differs = float(np.sqrt(self.unlike)) * find_tolerance(mean) * effect.floor
             named = replace(finding, differs=differs)
-            return self._named(named, mean, sorted({j, *partners}))
+            return self._judge_named(named, mean, sorted({j, *partners}))
         size = mean * effect.floor
         reach = NORMAL_95 * deviation
         ends = np.clip([size - reach, size + reach], *effect.bounds)
@@ -89,7 +89,7 @@ class Reading:
                 f" {effect.prior_sd:.2g}{unit})."
             )
             return replace(finding, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-        finding = result.bounded(finding)
+        finding = result.bound(finding)
         if low < high:
             return finding
         comparison = "less" if size < low else "more"
@@ -142,7 +142,7 @@ class Reading:
                 with_one += weight
         return without / with_one
 
-    def _named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
+    def _judge_named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
         """Return the verdict on a selected effect; ``mean``: in floors; ``members``: of its
         class.
         """

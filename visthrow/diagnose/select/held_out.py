@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
 from visthrow.diagnose.likelihood.evidence import FEWEST, NORMAL_95, STRONG, UNKNOWN_RATIO
-from visthrow.diagnose.likelihood.forms import HORIZONS, errors, predicted, readable, unit_of
+from visthrow.diagnose.likelihood.forms import HORIZONS, errors, predict, readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices
 from visthrow.diagnose.select import result
@@ -27,8 +27,8 @@ from visthrow.diagnose.select.candidates import (
     NOTHING,
     Names,
     columns_of,
-    freed,
-    shared,
+    integrate_shares,
+    list_shared,
 )
 from visthrow.diagnose.select.excess import LANDING, compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
@@ -63,7 +63,7 @@ class Work:
     before: Point  # nothing selected
     after: Point  # with the selected effects
     active: tuple[int, ...]
-    crossed: Crossed | None = None  # the cross-validation, if done
+    cross_validate: Crossed | None = None  # the cross-validation, if done
     candidates: tuple[int, ...] = ()  # effects that were free when the active ones were estimated
 
     @property
@@ -86,7 +86,7 @@ def groups_of(point: Point) -> tuple[list[int], str]:
     return groups, "parts of flights"
 
 
-def crossed(diagnosis: Diagnosis) -> Crossed:
+def cross_validate(diagnosis: Diagnosis) -> Crossed:
     """Repeat a selection without each of the flights, by the statistics, unless that was done.
 
     Random shares are integrated out. Candidates are free, as in the diagnosis, but their sizes are
@@ -101,12 +101,12 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     shares = {}  # as if every flight were a day
     for c, size in point.shares.items():
         shares[replace(c, group=FLIGHT) if c.group == DAY else c] = size
-    statistics = freed(point.by_window.by(groups), shares)
+    statistics = integrate_shares(point.by_window.sum_by(groups), shares)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
     trained = np.zeros((count, len(priors.floor)))
     named = Counter()
-    offered = shared(effects)
+    offered = list_shared(effects)
     selected = frozenset(offered[j] for j in work.active)
 
     def penalty(chosen: Names) -> float:
@@ -143,7 +143,7 @@ def count_telling(promised: ndarray) -> ndarray:
     return (promised >= np.minimum(STRONG, promised.mean(0))).sum(0)
 
 
-def borne_out(
+def compare_gains(
     statistics: Statistics, trained: ndarray, theta: ndarray
 ) -> tuple[float, float, float]:
     """Return the ratio of actual to predicted gain on held-out flights, with a 95 % interval.
@@ -154,7 +154,7 @@ def borne_out(
     ``trained``: sizes from the other flights, in floors, shape (F, K); ``theta``: sizes from all
     flights, shape (K,)."""
     promised = 0.5 * theta @ statistics.information @ theta
-    brought = 0.5 * (statistics.absolute.square - statistics.about(trained).square)
+    brought = 0.5 * (statistics.absolute.square - statistics.extrapolate(trained).square)
     return share_of(promised, brought)
 
 
@@ -272,10 +272,10 @@ def gain_of(
 def measure(diagnosis: Diagnosis) -> HeldOut:
     """Cross-validate the effects of a diagnosis."""
     work = diagnosis.work
-    cross = crossed(diagnosis)
+    cross = cross_validate(diagnosis)
     floors = work.problem.priors.floor
     sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
-    share = borne_out(cross.statistics, cross.trained, sizes / floors)
+    share = compare_gains(cross.statistics, cross.trained, sizes / floors)
     gains = channel_gains(work, cross.groups, cross.trained)
     return HeldOut(*share, gains, cross.named, len(cross.folds), cross.left_out)
 
@@ -290,7 +290,7 @@ class Doubt:
     reason: str = ""  # of the overall verdict, if no effect remains
 
 
-def judged(diagnosis: Diagnosis) -> Diagnosis:
+def judge(diagnosis: Diagnosis) -> Diagnosis:
     """Return the diagnosis with the effects that held-out flights confirm."""
     if diagnosis.overall == result.NO_EFFECT:
         return _innovations(diagnosis)
@@ -304,7 +304,9 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     )
     diagnosis = _withdrawn(diagnosis, Doubt(rivalled, why=why, reason=reason))
     while diagnosis.theta and diagnosis.overall in (result.KNOWN, result.UNKNOWN):
-        diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
+        diagnosis = replace(
+            diagnosis, work=replace(diagnosis.work, crossed=cross_validate(diagnosis))
+        )
         diagnosis = replace(diagnosis, held_out=measure(diagnosis))
         doubt = _doubt(diagnosis, diagnosis.held_out)
         if not doubt.names:
@@ -378,7 +380,7 @@ def _explain(diagnosis: Diagnosis) -> Diagnosis:
     unexplained = [] if compares_phases(diagnosis.work.after) else _find_unexplained(gains)
     if not unexplained:
         return replace(diagnosis, reasons=(_describe_known(diagnosis),))
-    reasons = tuple(_remaining(c, diagnosis.work) for c in unexplained)
+    reasons = tuple(_describe_remaining(c, diagnosis.work) for c in unexplained)
     return replace(diagnosis, overall=result.IN_PART, reasons=reasons)
 
 
@@ -431,7 +433,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         return level.after / floor
 
     block = max(diagnosis.levels, key=strength).block if diagnosis.levels else ""
-    reasons = tuple(_remaining(c, work) for c in unexplained)
+    reasons = tuple(_describe_remaining(c, work) for c in unexplained)
     return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=reasons)
 
 
@@ -460,7 +462,7 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     )
     left = replace(
         diagnosis,
-        findings=_doubted(diagnosis, doubt, remaining),
+        findings=_doubt_findings(diagnosis, doubt, remaining),
         theta={name: diagnosis.theta[name] for name in remaining},
         covariance=tuple(map(tuple, spread.tolist())),
         work=work,
@@ -474,7 +476,9 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     return replace(left, overall=result.UNKNOWN, block=block, reasons=reasons)
 
 
-def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tuple[Finding, ...]:
+def _doubt_findings(
+    diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]
+) -> tuple[Finding, ...]:
     """Return the findings with the new verdict on doubted effects and the members of their classes;
     ``remaining``: other effects.
     """
@@ -486,13 +490,13 @@ def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tu
             sentence = f"{f.sentence} But {doubt.why}."
             f = replace(f, verdict=doubt.verdict, sentence=sentence)
         if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
-            f = result.bounded(f)
+            f = result.bound(f)
         findings.append(f)
     return tuple(findings)
 
 
 def share_text(share: float, low: float, high: float) -> str:
-    """Return the result of :func:`borne_out` as a clause about held-out flights."""
+    """Return the result of :func:`compare_gains` as a clause about held-out flights."""
     if np.isnan(low):
         return "only one of them is informative"
     return (
@@ -512,7 +516,7 @@ def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     return f"fly once more{f', for example: {manoeuvres[0]}' if manoeuvres else ' like these'}"
 
 
-def _remaining(c: ChannelGain, work: Work) -> str:
+def _describe_remaining(c: ChannelGain, work: Work) -> str:
     """Return a sentence about a channel's remaining error and its kind."""
     factor, unit = readable(c.unit)
     text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
@@ -535,7 +539,7 @@ def _kind(work: Work, channel: int) -> str:
         times[window.flight].append(window.time.mean())
     for window in windows:
         rows = window.channel == channel
-        innovation, _, horizon = predicted(window, point.noise, window.residual)
+        innovation, _, horizon = predict(window, point.noise, window.residual)
         square = np.where(horizon < 0, 0.0, innovation**2)[rows]
         if components(window, channel) is not None and len(square) % 3 == 0:
             by_axis += square.reshape(-1, 3).sum(0)
@@ -559,12 +563,12 @@ def repeated_share(point: Point, laws: Indices) -> tuple[float, float, float]:
     interval; effects keep their sizes from all flights.
 
     ``laws``: indices of the laws' terms among the effects."""
-    statistics = point.by_window.by(groups_of(point)[0])
+    statistics = point.by_window.sum_by(groups_of(point)[0])
     count = len(point.problem.model.effects)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
     rows = statistics.information[:, laws]
     information = rows[:, :, laws]
-    score = statistics.about(names).score[:, laws]
+    score = statistics.extrapolate(names).score[:, laws]
     prior = np.diag(point.problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
     other_information = total - information
@@ -572,4 +576,4 @@ def repeated_share(point: Point, laws: Indices) -> tuple[float, float, float]:
     trained = np.linalg.solve(other_information, other_score[..., None])[..., 0]
     none = np.zeros(len(laws))
     part = replace(statistics, information=information, score=score, theta=none)
-    return borne_out(part, trained, np.linalg.solve(total, score.sum(0)))
+    return compare_gains(part, trained, np.linalg.solve(total, score.sum(0)))

@@ -22,10 +22,10 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.likelihood.evidence import Posterior, Priors
-from visthrow.diagnose.likelihood.forms import predicted
+from visthrow.diagnose.likelihood.forms import predict
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.models.model_interface import Indices
-from visthrow.diagnose.select.candidates import COARSE, COMMAND, REACH, Scatter, evidence_of, judged
+from visthrow.diagnose.select.candidates import COARSE, COMMAND, REACH, Scatter, evidence_of, judge
 from visthrow.diagnose.select.point import ROUNDS, Point, statistics_of
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
@@ -44,7 +44,7 @@ def _assume_lost(statistics: Statistics, effects: int, lost: ndarray) -> Statist
     """
     theta = np.tile(statistics.theta, (len(lost), 1))
     theta[:, effects:] = lost
-    return statistics.about(theta).first(effects)
+    return statistics.extrapolate(theta).first(effects)
 
 
 def divergence(lost: ndarray, share: float) -> float:
@@ -151,7 +151,7 @@ def _least_explained(point: Point) -> list[int]:
     """
     errors = []
     for window in point.windows:
-        innovation, expected, _ = predicted(window, point.noise, window.residual)
+        innovation, expected, _ = predict(window, point.noise, window.residual)
         errors.append((innovation**2 / expected).mean())
     return np.sort(np.argsort(errors)[-LOOKED_AT:]).tolist()
 
@@ -183,7 +183,7 @@ def verdict(
         if least.max() <= 0.0:
             return None
     counts = [changes.shape[1] for changes in columns]
-    scatter = judged(v, reach, least, threshold, sum(counts), COMMAND)
+    scatter = judge(v, reach, least, threshold, sum(counts), COMMAND)
     lost = probabilities[1][least.argmax()]
     count = len(priors.floor)
     scatter = _with_size(scatter, statistics.information[:, count:, count:], lost)

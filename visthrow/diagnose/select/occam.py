@@ -32,9 +32,9 @@ from visthrow.diagnose.select.candidates import (
     Names,
     Shares,
     columns_of,
-    drifting,
     evidence_of,
-    freed,
+    find_day_shares,
+    integrate_shares,
     over_deviations,
 )
 
@@ -106,12 +106,12 @@ class Linear:
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active = columns_of(chosen)
-        days = drifting(fixed)
+        days = find_day_shares(fixed)
         flights = {share: size for share, size in fixed.items() if share not in days}
-        statistics = freed(self.statistics, flights)
+        statistics = integrate_shares(self.statistics, flights)
         nats = []
         for shares in (days, *({**days, c: size} for size in sizes.tolist())):
-            varied = freed(statistics, shares)
+            varied = integrate_shares(statistics, shares)
             nats.append(evidence_of(varied, self.priors, active))
         return sizes, np.array(nats[1:]) - nats[0]
 
@@ -128,7 +128,7 @@ class Linear:
         return self._values[chosen]
 
     def _free(self, chosen: Names) -> Statistics:
-        return freed(self.statistics, self.shares(chosen)[0])
+        return integrate_shares(self.statistics, self.shares(chosen)[0])
 
     def total(self, chosen: Names) -> Posterior:
         """Return the posterior of all flights with a set's random shares integrated out."""
@@ -137,7 +137,7 @@ class Linear:
             self._totals[shares] = Posterior.of(self._free(chosen), self.priors)
         return self._totals[shares]
 
-    def added(self, subset: Names) -> dict[Names, float]:
+    def add(self, subset: Names) -> dict[Names, float]:
         """Return a set and its neighbours with one candidate more, with their values."""
         if subset not in self._added:
             base = self.value(subset)
@@ -181,9 +181,9 @@ class Linear:
         """Return the predicted gains of the random shares of one group [nats], at the sizes
         ``theta`` [floors].
         """
-        flights = self.statistics.by(self.statistics.days) if group == DAY else self.statistics
+        flights = self.statistics.sum_by(self.statistics.days) if group == DAY else self.statistics
         precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
-        misfit = (flights.about(theta).score) ** 2 / precision
+        misfit = (flights.extrapolate(theta).score) ** 2 / precision
         counts = [len(c.columns) for c in members]
         columns = [j for c in members for j in c.columns]
         deviations = [sd for c in members for sd in c.deviations]
@@ -206,7 +206,7 @@ class Linear:
         listed = {}
         for subset in (chosen, *(chosen - {c} for c in chosen)):
             if len(subset - centre) < MOST_NEW:
-                listed |= self.added(subset)
+                listed |= self.add(subset)
             else:
                 listed[subset] = self.value(subset)
         return listed

@@ -26,7 +26,7 @@ from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
     Statistics,
-    correlated_of,
+    correlate_all,
     grams_of,
     with_residuals,
 )
@@ -39,7 +39,12 @@ from visthrow.diagnose.models.model_interface import (
     Sizes,
     Window,
 )
-from visthrow.diagnose.select.candidates import Shares, estimate_shares, evidence_of, freed
+from visthrow.diagnose.select.candidates import (
+    Shares,
+    estimate_shares,
+    evidence_of,
+    integrate_shares,
+)
 
 ROUNDS = 3
 """Limit for Gauss-Newton steps between two linearisations, for successive linearisations, and for
@@ -95,7 +100,7 @@ class Problem:
         lost = tuple(self.lost[w] for w in windows) if self.lost else ()
         return replace(self, kept=tuple(self.kept[w] for w in windows), lost=lost)
 
-    def flown(self, theta: ndarray) -> Model | None:
+    def build_model(self, theta: ndarray) -> Model | None:
         """Return the model with the terms at their sizes as laws; None if linear columns represent
         them. ``theta`` is in floors.
         """
@@ -149,7 +154,7 @@ class Point:
     @cached_property
     def statistics(self) -> Statistics:
         """Return the statistics of flights with their random shares integrated out."""
-        return freed(self.plain, self.shares)
+        return integrate_shares(self.plain, self.shares)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -181,7 +186,7 @@ class Point:
         return nats + self.noise.log_prior
 
 
-def regathered(point: Point, integrals: Integrals | None = None, **changes: Any) -> Point:
+def regather(point: Point, integrals: Integrals | None = None, **changes: Any) -> Point:
     """Replace fields of a point and compute its statistics.
 
     ``integrals``: of the grams under the noise levels, if known; ``changes``: fields of the
@@ -197,7 +202,7 @@ def _sum_by_flight(
     problem: Problem, integrals: Integrals, grams: Sequence[Gram], theta: ndarray
 ) -> Statistics:
     statistics = integrals.statistics(grams, theta)
-    by_flight = statistics.by(statistics.flights)
+    by_flight = statistics.sum_by(statistics.flights)
     days = problem.model.days
     return replace(by_flight, days=[days[f] for f in by_flight.flights] if days else ())
 
@@ -215,7 +220,7 @@ def linearise(
     ``windows``: the model's windows at ``theta``, if known; ``shares``: random shares."""
     theta = problem.possible(theta)
     sizes = problem.sizes(theta)
-    flown = problem.flown(theta)
+    flown = problem.build_model(theta)
     if windows is None:
         windows = (flown or problem.model).windows(sizes)
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
@@ -225,7 +230,7 @@ def linearise(
         sizes_of = theta if flown is None else 0.0 * theta
         extended = parallel_map(lambda w: with_terms(w, problem.terms, sizes_of), windows_of)
     if commands:
-        extended = [_losing(*parts) for parts in zip(extended, commands, problem.lost)]
+        extended = [_lose_commands(*parts) for parts in zip(extended, commands, problem.lost)]
     cleaned, raw = _clean(problem, extended)
     noise, grams = levels.fit(cleaned, raw, start)
     integrals = Integrals(grams, noise)
@@ -277,7 +282,7 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: ndarray) -> W
     return replace(window, effects=effects, residual=window.residual - columns @ sizes)
 
 
-def _losing(window: Window, columns: ndarray, lost: ndarray) -> Window:
+def _lose_commands(window: Window, columns: ndarray, lost: ndarray) -> Window:
     """Return a window some of whose commands may be lost: their mean effect is subtracted, and the
     uncertainty of each becomes a nuisance.
 
@@ -310,7 +315,7 @@ def statistics_of(
     problem = point.problem
     floors = np.append(problem.priors.floor, np.ones(longest))
     grams = grams_of(wide, floors, len(problem.model.channels))
-    grams = correlated_of(grams, wide, point.noise.correlation_time)
+    grams = correlate_all(grams, wide, point.noise.correlation_time)
     noise = levels.only(point.noise, grams, rows)
     return Integrals(grams, noise).statistics(grams, point.theta)
 
@@ -318,11 +323,11 @@ def statistics_of(
 def only(point: Point, windows: Indices) -> Point:
     """Return the point with some of its windows, and noise levels estimated from these."""
     grams = [point.grams[w] for w in windows]
-    noise = levels.maximised(grams, levels.only(point.noise, grams, windows))[0]
+    noise = levels.maximise(grams, levels.only(point.noise, grams, windows))[0]
     kept = [point.windows[w] for w in windows]
     commands = [point.commands[w] for w in windows] if point.commands else []
     problem = point.problem.only(windows)
-    return regathered(
+    return regather(
         point, problem=problem, noise=noise, grams=grams, windows=kept, commands=commands
     )
 
@@ -345,13 +350,13 @@ def untracked_windows(point: Point) -> list[int]:
     return distant.tolist()
 
 
-def moved(point: Point, theta: ndarray) -> Point | None:
+def move(point: Point, theta: ndarray) -> Point | None:
     """Simulate at ``theta`` with the same kinds of blocks, and keep the derivatives and noise
     levels of ``point``; None if the simulation fails.
     """
     problem = point.problem
     theta = problem.possible(theta)
-    flown = problem.flown(theta)
+    flown = problem.build_model(theta)
     count = len(problem.model.effects)  # columns of terms are not taken anew
     sizes = problem.priors.floor[count:] * theta[count:] * (flown is None)
     simulated = (flown or problem.model).residuals(problem.sizes(theta), point.about)
@@ -365,7 +370,7 @@ def moved(point: Point, theta: ndarray) -> Point | None:
         residuals.append(residual)
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
     grams = with_residuals(point.grams, point.windows, problem.priors.floor, residuals)
-    return regathered(
+    return regather(
         point,
         point.integrals,
         theta=np.array(theta, dtype=float),
@@ -405,7 +410,7 @@ def with_noise_at(point: Point, theta: ndarray) -> Point:
     flight's random shares.
     """
     grams = with_shares(point, theta)
-    return regathered(point, noise=levels.maximised(grams, point.noise)[0])
+    return regather(point, noise=levels.maximise(grams, point.noise)[0])
 
 
 def with_shares(point: Point, theta: ndarray) -> list[Gram]:
@@ -416,10 +421,10 @@ def with_shares(point: Point, theta: ndarray) -> list[Gram]:
     if not shares.any():
         return list(point.grams)
     row = np.searchsorted(point.plain.flights, [gram.flight for gram in point.grams])
-    return [shifted(gram, change) for gram, change in zip(point.grams, shares[row])]
+    return [shift(gram, change) for gram, change in zip(point.grams, shares[row])]
 
 
-def shifted(gram: Gram, change: ndarray) -> Gram:
+def shift(gram: Gram, change: ndarray) -> Gram:
     """Return the inner products with the residual r - S change in place of r."""
     begin = gram.hidden
     part = gram.inner[:, :, begin:] @ change
@@ -428,7 +433,7 @@ def shifted(gram: Gram, change: ndarray) -> Gram:
     return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
 
 
-def fitted(point: Point, active: Indices) -> Point:
+def fit(point: Point, active: Indices) -> Point:
     """Fit the sizes of effects by Gauss-Newton steps, with fixed derivatives and simulated
     residuals; a step that does not lower the misfit is halved.
 
@@ -437,7 +442,7 @@ def fitted(point: Point, active: Indices) -> Point:
     named = np.isin(np.arange(len(point.theta)), list(active))
     best = point
     if np.any(point.theta[~named] != 0.0):
-        best = moved(point, np.where(named, point.theta, 0.0))
+        best = move(point, np.where(named, point.theta, 0.0))
     if best is None:
         return point
     kinds = point.problem.switches
@@ -474,7 +479,7 @@ def _step(point: Point, goal: ndarray) -> Point | None:
         change = share * (goal - point.theta)
         if np.abs(change).max() <= SMALL_STEP:
             break
-        trial = moved(point, point.theta + change)
+        trial = move(point, point.theta + change)
         if trial is not None and _misfit(trial) < _misfit(point):
             return trial
         share /= 2.0
@@ -492,13 +497,13 @@ def candidate(point: Point, active: Indices) -> Point:
 
     ``point``: gives derivatives, initial noise levels and kinds of blocks.
     """
-    point = fitted(point, active)
+    point = fit(point, active)
     point = with_noise_at(point, point.theta)
     for _ in range(TURNS):
         if predicted_gain(point, active) < TURNED:
             break
         before = point
-        point = fitted(point, active)
+        point = fit(point, active)
         if np.array_equal(point.theta, before.theta):
             break
         point = with_noise_at(point, point.theta)

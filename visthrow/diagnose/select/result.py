@@ -82,7 +82,7 @@ class Finding:
     differs: float = 0.0  # standard deviation between these flights and another [unit]
 
 
-def bounded(finding: Finding) -> Finding:
+def bound(finding: Finding) -> Finding:
     """Turn a finding into a bound on an effect that need not be present."""
     unit = unit_suffix(finding.unit)
     limits = f"{finding.low:.3g} and {finding.high:.3g}{unit}"

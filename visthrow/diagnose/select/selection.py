@@ -25,8 +25,8 @@ from visthrow.diagnose.select.candidates import (
     columns_of,
     estimate_shares,
     laws_of,
+    list_shared,
     random_shares,
-    shared,
     without_means,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases
@@ -37,7 +37,7 @@ from visthrow.diagnose.select.point import (
     Problem,
     candidate,
     curvature,
-    fitted,
+    fit,
     linearise,
     predicted_gain,
     with_noise_at,
@@ -97,7 +97,7 @@ class Selector:
         problem = self.problem
         flown = self.nominal.plain
         random = random_shares(problem.model.effects, problem.priors, flown, self._every)
-        self.candidates = shared(problem.effects) + random
+        self.candidates = list_shared(problem.effects) + random
         self._linear.clear()
 
     @cached_property
@@ -137,7 +137,7 @@ class Selector:
         """Run the selection, starting from a set."""
         for start in self._try(self.nominal, [begin] if begin else []):
             self._go(start)
-        while self._moved() or self._relinearise() or self._propose() or self._widen():
+        while self._move() or self._relinearise() or self._propose() or self._widen():
             pass
         return self
 
@@ -152,7 +152,7 @@ class Selector:
         self._offer()
         return True
 
-    def _moved(self) -> bool:
+    def _move(self) -> bool:
         """Simulate the most promising sets and move to the best; return False if the present set
         stays.
         """
@@ -164,7 +164,7 @@ class Selector:
         while chosen := self._choose_next(listed, leads, least):
             leads[chosen] = -np.inf
             tried = self._try(self.best.point, [chosen])
-            tried += self._try(self.best.point, self._reduced(tried))
+            tried += self._try(self.best.point, self._reduce(tried))
             leads |= {t.chosen: t.lead for t in tried}
             possible = [t for t in tried if t.lead > -self._limit(t.chosen)]
             near += [t for t in possible if self.is_admissible(t)]
@@ -287,7 +287,7 @@ class Selector:
             trials.append(trial)
         return trials
 
-    def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
+    def _reduce(self, tried: Iterable[Trial]) -> list[Names]:
         """Reduce inadmissible sets that are ahead to their surely present members.
 
         If a set contains the true effect and one that stood in for it, nothing remains of the
@@ -395,7 +395,7 @@ class Selector:
         self._simulated = {s: nats - trial.lead for s, nats in self._simulated.items()}
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
-        point = self._settled(trial.point, trial.columns, last)
+        point = self._settle(trial.point, trial.columns, last)
         if point is not trial.point or point.shares:
             shares, occam = self.linear(point).shares(trial.chosen)
             if shares:
@@ -405,7 +405,7 @@ class Selector:
         self._visited.add(trial.chosen)
         self._linear = {self.nominal: self.linear(self.nominal)}
 
-    def _settled(self, point: Point, active: list[int], last: bool) -> Point:
+    def _settle(self, point: Point, active: list[int], last: bool) -> Point:
         """Linearise at a set and fit its sizes again, unless the last derivatives still hold or the
         search is going on.
         """
@@ -425,7 +425,7 @@ class Selector:
                 self.progress(f"the last derivatives stay: {error}")
                 break
             before = point
-            point = fitted(self.origin, active)
+            point = fit(self.origin, active)
             close = np.abs(point.theta - before.theta).max() <= SPIKE
             if close or curvature(self.origin, point) <= SPIKE:
                 break
@@ -464,7 +464,7 @@ class Selector:
         if not shortlist:
             return False
         points = list(dict.fromkeys((self.nominal, self.origin, self.best.point)))
-        widened = dict(zip(points, terms.extended(points, shortlist)))
+        widened = dict(zip(points, terms.extend(points, shortlist)))
         self.best = replace(self.best, point=widened[self.best.point])
         self.nominal = widened[self.nominal]
         self.origin = widened[self.origin]

@@ -20,9 +20,9 @@ from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
 from visthrow.diagnose.likelihood.integrals import Integrals
 from visthrow.diagnose.likelihood.marginal import (
     Statistics,
-    correlated_of,
+    correlate_all,
     grams_of,
-    in_one_channel,
+    merge_channels,
     with_latent_effects,
 )
 from visthrow.diagnose.models.law_terms import (
@@ -38,7 +38,7 @@ from visthrow.diagnose.models.law_terms import (
 )
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Indices
 from visthrow.diagnose.select.excess import LANDING, positions_of
-from visthrow.diagnose.select.point import Point, regathered, with_shares, with_terms
+from visthrow.diagnose.select.point import Point, regather, with_shares, with_terms
 from visthrow.diagnose.select.result import Law
 
 LAW = 2.0 * STRONG
@@ -107,10 +107,10 @@ def with_capped_gusts(point: Point) -> tuple[Point, Statistics]:
     capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
     noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
-    extended = [with_latent_effects(in_one_channel(gram, noise.scale)) for gram in grams]
+    extended = [with_latent_effects(merge_channels(gram, noise.scale)) for gram in grams]
     unscaled = replace(noise, scale=np.ones(1))
     parts = Integrals(extended, unscaled).statistics(extended, point.theta)
-    plain = parts.first(len(point.theta)).by(parts.flights)
+    plain = parts.first(len(point.theta)).sum_by(parts.flights)
     return replace(point, noise=noise, grams=grams, plain=plain, shares={}), parts
 
 
@@ -171,7 +171,7 @@ class Survey:
         information = np.einsum("lti,ltj->tij", *parts)
         return square, int(acting.sum()) // 3, information, score.reshape(terms, columns), cross
 
-    def _left(self, screened: Screen) -> tuple[ndarray, ndarray]:
+    def _condition_terms(self, screened: Screen) -> tuple[ndarray, ndarray]:
         """Return information and score of each term, conditional on the selected effects."""
         cross = screened.cross
         known = np.einsum("tik,kl,tjl->tij", cross, self.sigma, cross, optimize=True)
@@ -184,7 +184,7 @@ class Survey:
         """Return the gain of each term beside the selected effects [nats], and its prior deviation,
         which corresponds to ``reach`` at the knots.
         """
-        information, score = self._left(screened)
+        information, score = self._condition_terms(screened)
         size = screened.size
         most = screened.size.max()
         prior = reach / np.maximum(size, 1e-12 * most + 1e-300)
@@ -201,7 +201,7 @@ class Survey:
 
         Unlike effects, a term has neither bounds nor a typical size. It must not replace an
         equivalent effect only because that effect is at its bound or unusually large."""
-        information, score = self._left(screened)
+        information, score = self._condition_terms(screened)
         information = information[:, 0, 0]
         score = score[:, 0]
         shared = (screened.cross[:, 0] @ self.sigma)[:, causes]
@@ -274,7 +274,7 @@ def best_curves(
     return curves
 
 
-def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point]:
+def extend(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point]:
     """Add terms of size 0 to points of one problem, without simulation."""
     problem = points[0].problem
     wide = replace(problem, terms=(*problem.terms, *terms))
@@ -284,9 +284,9 @@ def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point
     for point in points:
         windows = [with_terms(window, terms, none) for window in point.windows]
         grams = grams_of(windows, wide.priors.floor, channels)
-        grams = correlated_of(grams, windows, point.noise.correlation_time)
+        grams = correlate_all(grams, windows, point.noise.correlation_time)
         theta = np.append(point.theta, none)
-        widened.append(regathered(point, problem=wide, theta=theta, windows=windows, grams=grams))
+        widened.append(regather(point, problem=wide, theta=theta, windows=windows, grams=grams))
     return widened
 
 
@@ -305,7 +305,7 @@ def without_laws(point: Point) -> Point:
         cross = gram.cross[:, kept]
         grams.append(replace(gram, inner=inner, cross=cross))
     theta = point.theta[:count]
-    return regathered(point, problem=plain, theta=theta, windows=windows, grams=grams)
+    return regather(point, problem=plain, theta=theta, windows=windows, grams=grams)
 
 
 def shortlist(

@@ -26,10 +26,10 @@ from visthrow.diagnose.select.candidates import (
     between_flights,
     columns_of,
     estimate_shares,
-    freed,
-    judged,
+    integrate_shares,
+    judge,
     laws_of,
-    relinearised_per_flight,
+    relinearise_per_flight,
     unit_suffix,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases, floors_of, levels, too_strong
@@ -39,7 +39,7 @@ from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
     Point,
-    moved,
+    move,
     with_floors_noise,
     with_noise_at,
 )
@@ -207,12 +207,12 @@ def share_verdict(
     """
     sizes, nats = linear.profile(chosen, fixed_shares, c)
     statistics = linear.statistics
-    flights = statistics.by(statistics.days) if c.group == DAY else statistics
+    flights = statistics.sum_by(statistics.days) if c.group == DAY else statistics
     informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
     count = int(informative.sum())
     reach = sizes * effect.prior_sd
     needed = threshold + c.penalty
-    return judged(replace(effect, name=c.name), reach, nats, needed, count, c.group)
+    return judge(replace(effect, name=c.name), reach, nats, needed, count, c.group)
 
 
 def _straight(point: Point, active: Indices, j: int) -> Statistics:
@@ -220,10 +220,10 @@ def _straight(point: Point, active: Indices, j: int) -> Statistics:
     theta = np.where(named, point.theta, 0.0)
 
     def simulate(position: np.ndarray) -> Statistics | None:
-        moved_point = moved(point, position)
+        moved_point = move(point, position)
         return None if moved_point is None else moved_point.plain
 
-    return relinearised_per_flight(point.plain, theta, point.problem.priors, j, simulate)
+    return relinearise_per_flight(point.plain, theta, point.problem.priors, j, simulate)
 
 
 def _about_means(point: Point, active: Indices, varying: Iterable[int]) -> Point:
@@ -233,7 +233,7 @@ def _about_means(point: Point, active: Indices, varying: Iterable[int]) -> Point
     statistics = point.plain
     for j in sorted(varying):
         statistics = _straight(replace(point, plain=statistics), active, j)
-    shared = freed(statistics, point.shares)
+    shared = integrate_shares(statistics, point.shares)
     return replace(point, plain=shared, shares={})
 
 
@@ -336,7 +336,9 @@ def _events(selection: Selector, point: Point) -> tuple[int, ...]:
     return tuple(sorted(events))
 
 
-def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
+def report_out_of_domain(
+    model: Model, windows: Sequence[Window], usable: int, seed: int
+) -> Diagnosis:
     """Return the diagnosis if the simulation fails in most windows."""
     reason = (
         f"the simulation stays finite in {usable} of {len(windows)} windows; check units, axes and"

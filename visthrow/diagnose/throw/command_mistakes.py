@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from visthrow.diagnose.throw.recorded_flight import measured
+from visthrow.diagnose.throw.recorded_flight import find_measured
 from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust_checks
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -52,7 +52,7 @@ class Mistake:
             " logs. It was corrected."
         )
 
-    def mended(self, log: FlightLog) -> FlightLog:
+    def mend(self, log: FlightLog) -> FlightLog:
         """Return the log with corrected commands."""
         if "command" not in log:
             return log
@@ -61,7 +61,7 @@ class Mistake:
         return replace(log, channels={**log.channels, "command": replace(c, values=values)})
 
 
-def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
+def suspect(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     """List possible mistakes in the commands of all logs, in the order of correction. Their
     evidence is not yet known.
     """
@@ -73,13 +73,13 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
         related = related or list(filter(None, map(_relate_rates, logs)))
         if related and (mistake := look(related)) is not None:
             mistakes.append(mistake)
-            logs = list(map(mistake.mended, logs))
+            logs = list(map(mistake.mend, logs))
             related = None  # corrected commands relate otherwise
     mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
     return mistakes if mistake is None else [*mistakes, mistake]
 
 
-def commanded(
+def derive_commands(
     logs: Sequence[FlightLog], plant: PlantParams
 ) -> tuple[list[FlightLog], tuple[Mistake, ...]]:
     """Derive commands from throttle and commanded rates where an autopilot's log has no commands.
@@ -126,7 +126,7 @@ def _calibrate(log: FlightLog) -> tuple[float, float, float, float] | None:
     time = throttle.time
     share = throttle.values[:, 0]
     flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else share > 0.0
-    place = measured(log, "pos_w")
+    place = find_measured(log, "pos_w")
     if place is not None:
         height = place.at(time)[:, 2]
         flies &= height > height.min() + min(LIFTED, 0.5 * np.ptp(height))
@@ -153,7 +153,7 @@ def _relate_rates(log: FlightLog) -> relations.Relation | None:
     """Relate the measured attitude's rates to the commanded ones; None if the vehicle hardly
     turns.
     """
-    attitude = measured(log, "quat_wb")
+    attitude = find_measured(log, "quat_wb")
     if attitude is None or "command" not in log or len(attitude.time) < 50:
         return None
     rates = attitude.rates()
@@ -208,7 +208,7 @@ def _thrust_unit(
     """Return a wrong unit of the commanded thrust: the one that makes its median closest to the
     weight that it carries [N].
     """
-    commands = [c for log in logs if (c := measured(log, "command")) is not None]
+    commands = [c for log in logs if (c := find_measured(log, "command")) is not None]
     medians = [np.median(c.values[:, 0]) for c in commands]
     ratio = np.median(medians) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:

@@ -95,7 +95,7 @@ def cut(
     return [c for c in cuts if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST]
 
 
-def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
+def thin(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
     """Thin long flights to :data:`WINDOW_LIMIT` windows.
 
     All throws and ballistic windows are kept. The others are divided into groups of neighbours, and

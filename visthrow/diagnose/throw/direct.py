@@ -18,8 +18,8 @@ from sim.effects.setting import Setting
 from sim.params import SensingParams
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.initial_states import smoothed, without_frame, without_marker
-from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, measured
+from visthrow.diagnose.throw.initial_states import smooth, without_frame, without_marker
+from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, find_measured
 from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
 
@@ -54,7 +54,7 @@ class DirectSamples:
     time: ndarray  # stamps [s], shape (N,)
     values: ndarray  # shape (N,)
     sigma: float
-    predicted: Callable[[Setting], ndarray]  # prediction in a setting, shape (N,)
+    predict: Callable[[Setting], ndarray]  # prediction in a setting, shape (N,)
 
 
 def direct_samples(
@@ -92,7 +92,7 @@ def has_camera_keypoints(log: FlightLog) -> bool:
     config = log.meta.get("config")
     source = config.get("keypoints", "") if isinstance(config, dict) else ""
     by_camera = source == "detector" or (source == "" and "policy" not in log.meta)
-    return by_camera and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
+    return by_camera and find_measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
 
 
 def with_direct(
@@ -143,13 +143,13 @@ def _predict_alike(a: Setting, b: Setting) -> bool:
 def _landing(time: float, point_w: ndarray) -> DirectSamples:
     """Return the height of the payload's centre at its landing [m], as one sample."""
 
-    def predicted(setting: Setting) -> ndarray:
+    def predict(setting: Setting) -> ndarray:
         x = setting.sensing
         point = without_frame(x, point_w)
         point[2] = setting.plant.release.landing_height + x.payload_offset[2]
         return (1.0 + x.scale) * Rotation.from_rotvec(x.frame_tilt).apply(point)[2:]
 
-    return DirectSamples(LANDING, np.array([time]), point_w[2:], LANDING_SIGMA, predicted)
+    return DirectSamples(LANDING, np.array([time]), point_w[2:], LANDING_SIGMA, predict)
 
 
 def _camera_view(
@@ -163,7 +163,7 @@ def _camera_view(
         return []
     time, points, valid = view["time"], view["points"], view["valid"]
 
-    def predicted(setting: Setting) -> ndarray:
+    def predict(setting: Setting) -> ndarray:
         """Return the predicted keypoints; NaN if the setting's lens is invalid."""
         x = setting.sensing
         try:
@@ -182,7 +182,7 @@ def _camera_view(
 
     stamps = np.broadcast_to(time[:, None, None], points.shape)[valid]
     sigma = max(_noise(points, valid), LEAST_KEYPOINT_SIGMA)
-    return [DirectSamples(KEYPOINTS, stamps, points[valid], sigma, predicted)]
+    return [DirectSamples(KEYPOINTS, stamps, points[valid], sigma, predict)]
 
 
 def _reach(camera) -> ndarray:
@@ -197,7 +197,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     """Collect the keypoints of one window: stamps, points, their validity, the goal, and splines
     through smoothed poses.
     """
-    time, points = measured(log, KEYPOINTS)
+    time, points = find_measured(log, KEYPOINTS)
     first, last = flight.payload.time[[0, -1]]
     during = (time >= c.start) & (time < c.end) & (time > first) & (time < last)
     if np.count_nonzero(during) < 5:
@@ -219,7 +219,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         ("payload", flight.payload, x.payload_delay),
     ):
         stamped = replace(track, time=track.time - delay)  # times of measurement
-        fits = [smoothed(stamped, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
+        fits = [smooth(stamped, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
         if any(fit is None for fit in fits):
             return None
         values = np.array([value for value, _ in fits])

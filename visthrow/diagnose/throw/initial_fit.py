@@ -18,11 +18,11 @@ from visthrow.diagnose.throw.initial_states import (
     States,
     deviations,
     directions,
-    moved_along,
+    move_along,
     rows_of,
-    stacked,
+    stack,
 )
-from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation, carried
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation, carry_states
 
 DAMPING = 1e-3  # of the first Levenberg-Marquardt step
 DAMPING_MOST = 1e5  # at which the fit of a window ends
@@ -167,16 +167,16 @@ class InitialFit:
         self.directions = directions(simulation.settings[0].plant)
         windows = range(len(flights.cuts))
         self._fits = [_WindowFit(flights, w, self.directions) for w in windows]
-        self._shortened = flights.ended([fit.end for fit in self._fits])
+        self._shortened = flights.end_early([fit.end for fit in self._fits])
 
     @property
     def slopes(self) -> dict[int, ndarray]:
         """Return the derivatives of windows' samples by their initial states, as taken last."""
         return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
-    def settled(self, slopes: Mapping[int, ndarray]) -> States:
+    def settle(self, slopes: Mapping[int, ndarray]) -> States:
         """Fit states, starting from those of a simulation through the windows; see :meth:`fit`."""
-        states, _ = carried(self.flights, self.simulation)
+        states, _ = carry_states(self.flights, self.simulation)
         return self.fit(states, slopes)
 
     def fit(self, states: States, slopes: Mapping[int, ndarray]) -> States:
@@ -197,7 +197,7 @@ class InitialFit:
             rows = _numbers(remaining)
             done = states[MOVED][rows]
             steps, promised = zip(*parallel_map(_WindowFit.increment, remaining, done))
-            trial = moved_along(rows_of(states, rows), self.directions, np.array(steps))
+            trial = move_along(rows_of(states, rows), self.directions, np.array(steps))
             flown = self._residuals(trial, remaining)
             helps = np.array(list(map(_WindowFit.judge, remaining, flown, promised)))
             for name, value in states.items():
@@ -221,7 +221,7 @@ class InitialFit:
         for row, fit in enumerate(fits):
             rows = [row, *[(1 + d) * len(fits) + row for d in fit.free]]
             groups.append([Lane(fit.number, 0, row_moved, rough=True) for row_moved in rows])
-        moved = perturbed(rows_of(states, _numbers(fits)), self.directions)
+        moved = perturb(rows_of(states, _numbers(fits)), self.directions)
         changes = self.flights.differences(self.simulation, moved, groups, self._shortened)
         for fit, change in zip(fits, changes):
             steps = np.array([self.directions[d].step for d in fit.free])
@@ -256,7 +256,7 @@ def sensitive_samples(flights: ReplayedFlights, w: int) -> tuple[ndarray, float]
     return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
 
 
-def following(
+def compensate(
     flights: ReplayedFlights,
     w: int,
     window: Window,
@@ -281,9 +281,9 @@ def following(
     return moves
 
 
-def perturbed(states: States, directions: Sequence[Direction]) -> States:
+def perturb(states: States, directions: Sequence[Direction]) -> States:
     """Return the states followed by those perturbed along each direction: row ``(1 + d) W + w``."""
     rows = np.arange(len(states["pos_w"]))
     steps = np.diag([d.step for d in directions]).repeat(len(rows), axis=0)
-    moved = moved_along(rows_of(states, np.tile(rows, len(directions))), directions, steps)
-    return stacked([states, moved])
+    moved = move_along(rows_of(states, np.tile(rows, len(directions))), directions, steps)
+    return stack([states, moved])

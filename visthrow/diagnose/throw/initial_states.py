@@ -137,7 +137,7 @@ def _tangents(n: ndarray) -> ndarray:
     return np.stack((first, np.cross(n, first)), axis=-2)
 
 
-def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray) -> States:
+def move_along(states: States, directions: Sequence[Direction], sizes: ndarray) -> States:
     """Move states along all directions by ``sizes``, shape (S, directions). Directions of the rope
     must precede those of its rates.
     """
@@ -182,12 +182,12 @@ def rows_of(states: States, rows: ndarray) -> States:
     return {name: value[rows] for name, value in states.items()}
 
 
-def stacked(parts: list[States]) -> States:
+def stack(parts: list[States]) -> States:
     """Concatenate states."""
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
 
-def smoothed(
+def smooth(
     samples: ChannelSamples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[ndarray, ndarray] | None:
     """Fit a local polynomial to the samples about a time; return its value and derivative there,
@@ -236,11 +236,11 @@ def measured_state(
     x = setting.sensing
     plant = setting.plant
     instant = time + x.vehicle_delay
-    pos, vel = smoothed(flight.vehicle, instant) or (flight.vehicle.values[0], np.zeros(3))
-    quat, rate = smoothed(flight.attitude, instant) or (flight.attitude.values[0], np.zeros(3))
+    pos, vel = smooth(flight.vehicle, instant) or (flight.vehicle.values[0], np.zeros(3))
+    quat, rate = smooth(flight.attitude, instant) or (flight.attitude.values[0], np.zeros(3))
     attitude = without_marker(x, Rotation.from_quat(quat))
     rate = Rotation.from_rotvec(x.marker_rotation).apply(rate)
-    gyro = flight.gyro and smoothed(flight.gyro, time + x.gyro_delay)
+    gyro = flight.gyro and smooth(flight.gyro, time + x.gyro_delay)
     if gyro:
         rate = gyro[0] - x.gyro_bias
     off = np.subtract(x.marker_offset, plant.vehicle.body.com)
@@ -249,7 +249,7 @@ def measured_state(
     out["quat_wb"][0] = attitude.as_quat()
     out["vel_w"][0] = vel - attitude.apply(cross(rate, off))
     out["rate_b"][0] = rate
-    track = flight.payload and smoothed(flight.payload, time + x.payload_delay)
+    track = flight.payload and smooth(flight.payload, time + x.payload_delay)
     if track and payload in (ATTACHED, LOOSE):
         point, speed = without_frame(x, np.array(track))
         point = point - x.payload_offset

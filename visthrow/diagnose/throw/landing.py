@@ -152,7 +152,7 @@ def _fly(
     cuts = []
     for n, (begin, end) in spans.items():
         cuts += _approach(model, n, begin, end)
-    setting, states = model.begun(theta, cuts)
+    setting, states = model.begin(theta, cuts)
     release = setting.plant.release
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
@@ -166,7 +166,7 @@ def _fly(
         time = onward.samples[i][2].time
         path = measured[first : first + len(time), i]
         free = time > looked[c.flight].latch + release.lag
-        points.append(_crossing(path[free], release.landing_height))
+        points.append(_find_crossing(path[free], release.landing_height))
     return np.array(points)
 
 
@@ -188,7 +188,7 @@ def _extend_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
     return replace(flight, payload=payload, gyro=None)
 
 
-def _crossing(path: ndarray, height: float) -> ndarray:
+def _find_crossing(path: ndarray, height: float) -> ndarray:
     """Return the point at which a path, shape (T, 3), falls through a height; NaN if it does
     not.
     """

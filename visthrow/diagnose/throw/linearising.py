@@ -22,7 +22,7 @@ from visthrow.diagnose.throw.replay import (
     Lane,
     ReplayedFlights,
     Simulation,
-    flown_alike,
+    fly_alike,
 )
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
@@ -118,7 +118,7 @@ class Linearisation:
         self._blocks = [e.block for e in effects]
         kinds = {flights.kind(w) for w in range(len(flights.cuts))}
         self._alike = {
-            kind: np.array([flown_alike(kind, self._setting, x) for x in perturbed], dtype=bool)
+            kind: np.array([fly_alike(kind, self._setting, x) for x in perturbed], dtype=bool)
             for kind in kinds
         }
 

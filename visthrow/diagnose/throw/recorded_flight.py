@@ -71,7 +71,7 @@ class RecordedFlight:
         return min(self.command_time[-1] + period, self.vehicle.time[-1] + 1e-6)
 
 
-def measured(log: FlightLog, name: str) -> Samples | None:
+def find_measured(log: FlightLog, name: str) -> Samples | None:
     """Return the valid samples of a channel, the measured ones if a log also holds the truth; None
     if there are none.
     """
@@ -79,7 +79,7 @@ def measured(log: FlightLog, name: str) -> Samples | None:
 
 
 def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
-    samples = measured(log, name)
+    samples = find_measured(log, name)
     if samples is None:
         return None
     time, values = samples
@@ -149,7 +149,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
 
     Raises DiagnoseError: no commands, or no poses of the vehicle.
     """
-    missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
+    missing = [name for name in ("command", "pos_w", "quat_wb") if find_measured(log, name) is None]
     if missing:
         raise DiagnoseError(
             f"flight {number} holds no {' and no '.join(missing)}; a replay needs command (or an"
@@ -163,7 +163,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _pair(pos, quat, number)
-    landing, landing_point = _landing(log)
+    landing, landing_point = _find_landing(log)
     time, command = log["command"].samples()
     return RecordedFlight(
         time,
@@ -175,7 +175,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
         _payload(log, landing),
         _samples(log, "rate_b"),
         _voltage(log),
-        _hanging(log),
+        _hangs(log),
         landing_point,
     )
 
@@ -227,23 +227,23 @@ def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
     return [measured if f.hanging is None else f.hanging for f, measured in zip(flights, hanging)]
 
 
-def _hanging(log: FlightLog) -> bool | None:
-    attached = measured(log, "attached")
+def _hangs(log: FlightLog) -> bool | None:
+    attached = find_measured(log, "attached")
     return None if attached is None else bool(attached.values[0, 0])
 
 
 def _latch(log: FlightLog) -> float:
     """Return when the release was commanded."""
-    commands = measured(log, "release_command")
+    commands = find_measured(log, "release_command")
     if commands is None:
         return NEVER
     time, values = commands
     return min(time[values[:, 0] > 0.5], default=NEVER)
 
 
-def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
+def _find_landing(log: FlightLog) -> tuple[float, ndarray | None]:
     """Return time and point of the payload's landing."""
-    landing = measured(log, "landing")
+    landing = find_measured(log, "landing")
     if landing is None:
         return NEVER, None
     return landing.time[0], landing.values[0]
@@ -251,7 +251,7 @@ def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
 
 def _voltage(log: FlightLog) -> float | None:
     """Return the terminal voltage at the start of a log: a median, as single samples are noisy."""
-    voltage = measured(log, "battery_voltage")
+    voltage = find_measured(log, "battery_voltage")
     if voltage is None:
         return None
     time, volts = voltage

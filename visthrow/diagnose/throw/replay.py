@@ -23,7 +23,7 @@ from visthrow.diagnose.throw.initial_states import (
     hover_state,
     measured_state,
     rows_of,
-    stacked,
+    stack,
 )
 from visthrow.diagnose.throw.recorded_flight import (
     NEVER,
@@ -46,7 +46,7 @@ STABLE = 1.75
 BATCH, CUDA_BATCH = 4096, 32768
 
 
-def grouped(windows: Indices, lanes: Indices, room: int) -> list[list[int]]:
+def split_windows(windows: Indices, lanes: Indices, room: int) -> list[list[int]]:
     """Split windows into runs of at most ``room`` lanes, or of one window; ``lanes``: number of
     lanes of each window.
     """
@@ -279,7 +279,7 @@ class ReplayedFlights:
             first = last
         return differences
 
-    def ended(self, ends: Sequence[float]) -> Recording:
+    def end_early(self, ends: Sequence[float]) -> Recording:
         """Return the recording with earlier ends of windows [s]; later samples are undefined."""
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
 
@@ -293,7 +293,7 @@ def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: Channe
     return np.concatenate((pairs, rest_of_rows))
 
 
-def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:
+def fly_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:
     """Return whether two settings lead to the same motion in windows of a kind. They may differ in
     sensors and in parameters without effect there.
     """
@@ -308,7 +308,7 @@ def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bo
     return plant == setting.plant
 
 
-def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, States]:
+def carry_states(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, States]:
     """Return the initial states of all windows and the states at their ends.
 
     Measured fields are smoothed measurements. Other fields are carried on from the end of the
@@ -331,9 +331,9 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
             if gap:
                 states[w]["gyro"] = states[w]["rate_b"].copy()
         lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(windows)]
-        flown = flights.fly(simulation, stacked([states[w] for w in windows]), lanes)
+        flown = flights.fly(simulation, stack([states[w] for w in windows]), lanes)
         for row, w in enumerate(windows):
             ends[w] = rows_of(flown.ends, np.array([row]))
-    begun = stacked(states)
+    begun = stack(states)
     begun[MOVED] = np.zeros((len(states), len(directions(setting.plant))))
-    return begun, stacked(ends)
+    return begun, stack(ends)

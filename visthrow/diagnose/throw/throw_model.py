@@ -18,15 +18,15 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.models.model_interface import Indices, Linearised, Model, Sizes, Window
 from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
-from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
+from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thin
 from visthrow.diagnose.throw.direct import direct_samples, needs_no_flight, with_direct
-from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
+from visthrow.diagnose.throw.initial_fit import InitialFit, compensate, perturb
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
     States,
     deviations,
     directions,
-    moved_along,
+    move_along,
 )
 from visthrow.diagnose.throw.landing import landings
 from visthrow.diagnose.throw.linearising import Linearisation
@@ -37,8 +37,8 @@ from visthrow.diagnose.throw.replay import (
     Lane,
     ReplayedFlights,
     Simulation,
-    carried,
-    grouped,
+    carry_states,
+    split_windows,
 )
 from visthrow.logs.flightlog import FlightLog
 
@@ -127,7 +127,7 @@ class ThrowModel(Model):
                 f"{len(flights)} flights hold no stretch of poses and commands long enough to"
                 " replay"
             )
-        chosen = thinned(cuts, flights)
+        chosen = thin(cuts, flights)
         if len(chosen) < len(cuts):
             count = f"{len(chosen)} of {len(cuts)} windows"
             self.notes = (f"{count} are looked at: all throws, and where commands vary most",)
@@ -139,11 +139,11 @@ class ThrowModel(Model):
         """Set up the windows without the time in which ropes were slack; return initial states."""
         self.flights = ReplayedFlights(flights, cuts, self.setting)
         simulation = self.simulation(self.setting)
-        states, ends = carried(self.flights, simulation)
+        states, ends = carry_states(self.flights, simulation)
         without_slack = self._cut_slack(ends)
         if without_slack != cuts:
             self.flights = ReplayedFlights(flights, without_slack, self.setting)
-            states, _ = carried(self.flights, simulation)
+            states, _ = carry_states(self.flights, simulation)
         return states
 
     def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
@@ -171,20 +171,20 @@ class ThrowModel(Model):
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         setting = self.at(theta)
         ways = directions(setting.plant)  # another kind of block has other states
-        states = self._settled_at[_key(theta)] = self._settled(setting)
+        states = self._settled_at[_key(theta)] = self._settle(setting)
         entries = self.entries.values()
         steps = np.array([self._step(e, theta.get(e.name, 0.0)) for e in entries])
         settings = [setting, *[e.apply(setting, step) for e, step in zip(entries, steps)]]
         graded = len(self._graded)
         simulation = self.simulation(*settings[: 1 + graded])
-        begun = perturbed(states, ways)
+        begun = perturb(states, ways)
         linearisation = Linearisation(
             self.flights, simulation, self._graded, steps[:graded], ways, begun
         )
         lanes = 2 + graded + len(ways) + 9 * self.flights.knots[self._retained]
         room = BATCH if self.device == "cpu" else CUDA_BATCH
         listed = []
-        for batch in grouped(self._retained, lanes, room):
+        for batch in split_windows(self._retained, lanes, room):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         whole = []
         for w, window in zip(self._retained, self._add_switches(theta, listed)):
@@ -217,7 +217,7 @@ class ThrowModel(Model):
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = self.at({**theta, e.name: 0.0 if on else 1.0})
         sign = -1.0 if on else 1.0
-        flown = self._flown(elsewhere, self._settled(elsewhere))
+        flown = self._fly(elsewhere, self._settle(elsewhere))
         moved = self._settled_at[_key(theta)][MOVED]
         present = deviations(directions(self.at(theta).plant), self.flights.cuts) > 0.0
         columns = []
@@ -226,7 +226,7 @@ class ThrowModel(Model):
             columns.append(sign * (fitted - after))
         return columns
 
-    def _flown(self, setting: Setting, states: States) -> list[ndarray]:
+    def _fly(self, setting: Setting, states: States) -> list[ndarray]:
         """Return the residuals of all windows' replayed samples in a setting."""
         lanes = [Lane(w, 0, w) for w in self._retained]
         return self.flights.residuals(self.simulation(setting), states, lanes)
@@ -234,8 +234,8 @@ class ThrowModel(Model):
     def residuals(self, theta: Sizes, linearised: Linearised) -> list[ndarray]:
         """See :class:`.model_interface.Model`."""
         setting = self.at(theta)
-        states, moves = self._following(setting, theta, linearised)
-        flown = self._flown(setting, states)
+        states, moves = self._follow(setting, theta, linearised)
+        flown = self._fly(setting, states)
         residuals = []
         for i, (w, residual) in enumerate(zip(self._retained, flown)):
             direct = [d.values - d.predicted(setting) for d in self._direct.get(w, ())]
@@ -268,11 +268,11 @@ class ThrowModel(Model):
         simulation = self.simulation(self.at(theta))
         states = self._settled_at[_key(theta)]
         columns = []
-        for part in grouped(list(groups), [len(lanes) for lanes in groups.values()], BATCH):
+        for part in split_windows(list(groups), [len(lanes) for lanes in groups.values()], BATCH):
             columns += flights.differences(simulation, states, [groups[w] for w in part])
         return columns
 
-    def _following(
+    def _follow(
         self, setting: Setting, theta: Sizes, linearised: Linearised
     ) -> tuple[States, dict[int, ndarray]]:
         """Adjust the states to other sizes of the effects by the derivatives; return the states and
@@ -286,8 +286,8 @@ class ThrowModel(Model):
         numbers = self._retained[list(linearised.windows)]
         sizes = np.zeros(present.shape)
         for w, window in zip(numbers, linearised.windows.values()):
-            sizes[w, present[w]] = following(self.flights, w, window, follows[present[w]], change)
-        states = moved_along(self._settled_at[_key(before)], ways, sizes)
+            sizes[w, present[w]] = compensate(self.flights, w, window, follows[present[w]], change)
+        states = move_along(self._settled_at[_key(before)], ways, sizes)
         moves = [states[MOVED][w, present[w]] for w in numbers]
         return states, dict(zip(linearised.windows, moves))
 
@@ -295,7 +295,7 @@ class ThrowModel(Model):
         """See the base class."""
         fine = replace(self.setting, step_square=1.0 / FINER**2)
         worst = np.zeros(len(self.channels))
-        flown = (self._flown(setting, self._nominal[0]) for setting in (self.setting, fine))
+        flown = (self._fly(setting, self._nominal[0]) for setting in (self.setting, fine))
         for w, plain, finer in zip(self._retained, *flown):
             change = np.abs(plain - finer) / self.flights.sigma[w]
             np.fmax.at(worst, self._channel(w), change)
@@ -303,19 +303,19 @@ class ThrowModel(Model):
 
     landings = landings
 
-    def begun(self, theta: Sizes, cuts: Sequence[Cut]) -> tuple[Setting, States]:
+    def begin(self, theta: Sizes, cuts: Sequence[Cut]) -> tuple[Setting, States]:
         """Return the setting with effects at ``theta``, and the initial states of other windows of
         the model's flights, fitted in it.
         """
         setting = self.at(theta)
         flights = ReplayedFlights(self.flights.flights, cuts, self.setting)
-        return setting, InitialFit(flights, self.simulation(setting)).settled({})
+        return setting, InitialFit(flights, self.simulation(setting)).settle({})
 
     def simulation(self, *settings: Setting) -> Simulation:
         """Prepare settings for simulation with this model's steps."""
         return Simulation(settings, self.substep, self.device)
 
-    def _settled(self, setting: Setting) -> States:
+    def _settle(self, setting: Setting) -> States:
         """Return the initial states fitted in a setting."""
         states, slopes = self._nominal
         if setting == self.setting:
@@ -323,7 +323,7 @@ class ThrowModel(Model):
         fitter = InitialFit(self.flights, self.simulation(setting))
         places = [way.place for way in directions(self.setting.plant)]
         alike = [way.place for way in fitter.directions] == places
-        return fitter.settled(slopes if alike else {})
+        return fitter.settle(slopes if alike else {})
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:

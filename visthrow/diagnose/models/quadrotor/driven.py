@@ -10,7 +10,7 @@ from numpy import ndarray
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
 from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, QuadrotorParams
-from visthrow.diagnose.models.quadrotor.flyer_windows import NEIGHBOUR, expect_thrust, lagged
+from visthrow.diagnose.models.quadrotor.flyer_windows import NEIGHBOUR, apply_lag, expect_thrust
 from visthrow.logs.flightlog import FlightLog
 
 SHORTEST = 1e-3  # shortest lag of the motors [s], which divides
@@ -86,7 +86,7 @@ class DrivenModel(NumericModel):
             data = self.stretches[int(owner)].data
             time, inputs = data["sent"]
             at_ends = data["start"] + grid[::2] - late
-            ends, integral = lagged(time, p.thrust(inputs), at_ends, lag)
+            ends, integral = apply_lag(time, p.thrust(inputs), at_ends, lag)
             mean = np.diff(integral, axis=0) / step
             lane = which == number
             thrust[::2, lane] = ends[:, None]

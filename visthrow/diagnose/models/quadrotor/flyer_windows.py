@@ -61,7 +61,7 @@ def cut_flying(
     # of long logs, only every stride-th window is cut
     stride = max(1, len(starts) // (4 * params.most_windows))
     for start in starts[::stride]:
-        if not all(covered(c, start, start + params.window) for c in driven):
+        if not all(is_covered(c, start, start + params.window) for c in driven):
             continue
         end = start + params.window
         if not flies(cut_commands(commands, start, end).values, params):
@@ -76,7 +76,7 @@ def cut_flying(
         yield start, tables, common
 
 
-def covered(channel: Channel, start: float, end: float) -> bool:
+def is_covered(channel: Channel, start: float, end: float) -> bool:
     """Return whether a channel has no large gap between two times."""
     during = (channel.time >= start) & (channel.time <= end)
     stamps = channel.time[channel.valid & during]
@@ -100,7 +100,7 @@ def cut_commands(commands: Samples, first: float, last: float) -> Samples:
     return Samples(time[begin:end], values[begin:end])
 
 
-def lagged(
+def apply_lag(
     time: ndarray, commanded: ndarray, instants: ndarray, lag: float
 ) -> tuple[ndarray, ndarray]:
     """Return the response of a first-order lag to held commands, and its integral up to a constant,
@@ -159,7 +159,7 @@ def lean_of(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarr
     share = force[:, :2] / np.maximum(force[:, 2:], IDLE * GRAVITY)
     share = share - np.median(share, axis=0)
     recent = cut_commands(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
-    tilt, _ = lagged(*recent, times[:, None], 1.0 / rate)
+    tilt, _ = apply_lag(*recent, times[:, None], 1.0 / rate)
     upright = np.array([0.0, 0.0, 1.0])
     turn = cross(np.pad(tilt, ((0, 0), (0, 1))), upright)
     gyro = log.samples("rate_b", 1)
