@@ -117,7 +117,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
         turned = np.diag([1.0, 1.0, 1.0, -1.0]).tolist()
         monkeypatch.setattr(
             interface,
-            "suspected",
+            "suspect",
             lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)],
         )
     model, logs = correct_interface_mistakes(wrong, PLANT, simulate)

@@ -435,7 +435,7 @@ def test_a_name_of_which_the_true_cause_leaves_nothing_is_dropped(monkeypatch):
     (begin,) = selector._try(selector.nominal, [stand_in])
     selector._go(begin)
     monkeypatch.setattr(selector, "_list_sets", lambda: {stand_in | true: 40.0})
-    assert selector._moved()
+    assert selector._move()
     assert selector.best.chosen == true
 
 
@@ -445,7 +445,7 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
 
     Where one flight alone shows it, no held-out flight can confirm it: that is not required here.
     """
-    monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
+    monkeypatch.setattr(held_out, "judge", lambda diagnosis: diagnosis)
     model = SyntheticModel(throws=1, free=2, law="speed", law_size=0.0, seed=4)
     model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
     model.law_size = 1.0

@@ -152,7 +152,8 @@ class Integrals:
     def __init__(self, grams: Sequence[Gram], noise: Noise):
         """Integrate initial states and latent forces out; ``noise``: as in :func:`fit_windows`.
 
-        Raises DiagnoseError: as :func:`fit_windows`, or the information is negative beyond rounding."""
+        Raises DiagnoseError: as :func:`fit_windows`, or the information is negative beyond
+        rounding."""
         self._shapes = _shapes(grams, noise)
         self._halves, of_windows = zip(*parallel_map(_reduce, grams, self._shapes))
         count = max(map(len, of_windows))

@@ -124,7 +124,7 @@ def train(
     strongest = strongest_forces(point)
     levels = [strongest[name] for name in table.blocks]
     reach = np.repeat(levels, columns[0].shape[1] // len(levels))
-    return Trained(statistics.about(sizes).by(groups), reach)
+    return Trained(statistics.extrapolate(sizes).sum_by(groups), reach)
 
 
 def tabulate_unexplained(point: Point, seed: int) -> dict | None:

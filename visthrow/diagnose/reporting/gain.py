@@ -221,7 +221,7 @@ def _nats(work: Work, cross: Crossed) -> float:
     """Return the increase of the held-out log-likelihood per sample; the models without and with
     effects have noise levels of their own.
     """
-    plain = work.before.by_window.by(cross.groups)
-    named = work.after.by_window.by(cross.groups)
-    square = named.about(cross.trained).square
+    plain = work.before.by_window.sum_by(cross.groups)
+    named = work.after.by_window.sum_by(cross.groups)
+    square = named.extrapolate(cross.trained).square
     return 0.5 * (plain.square.sum() - square.sum()) / named.samples.sum()

@@ -6,8 +6,9 @@ candidates is its log marginal likelihood minus the penalties of its members.
 
 A random share is the deviation of an effect's size in one flight, or on one day, from the size that
 all flights have in common. It is normal with standard deviation theta and is integrated out of the
-statistics (:func:`integrate_shares`). A flight far from the others is simulated again at other sizes, because
-the derivative is inexact that far away: it doubles the size of a release that is 40 ms early.
+statistics (:func:`integrate_shares`). A flight far from the others is simulated again at other
+sizes, because the derivative is inexact that far away: it doubles the size of a release that is
+40 ms early.
 
 Source: Laird and Ware 1982 (random effects).
 """
@@ -315,9 +316,9 @@ def find_tolerance(size: float) -> float:
 def between_flights(
     statistics: Statistics, priors: Priors, active: Indices, theta: ndarray
 ) -> tuple[float, ndarray]:
-    """Estimate the variance of selected effects between flights, relative to that which is
-    :func:`find_tolerance`; return it and the part of it that remains in the mean of these flights, shape
-    (K,).
+    """Estimate the variance of selected effects between flights, relative to the square of
+    :func:`find_tolerance`; return it and the part of it that remains in the mean of these flights,
+    shape (K,).
 
     Each flight may have a share of each selected effect, with a standard deviation of u times the
     allowed one. The variance is averaged over the posterior of u, whose prior is half normal. One

@@ -63,7 +63,7 @@ class Work:
     before: Point  # nothing selected
     after: Point  # with the selected effects
     active: tuple[int, ...]
-    cross_validate: Crossed | None = None  # the cross-validation, if done
+    crossed: Crossed | None = None  # the cross-validation, if done
     candidates: tuple[int, ...] = ()  # effects that were free when the active ones were estimated
 
     @property

@@ -112,12 +112,12 @@ def with_direct(
     """
     nominal, *perturbed = settings
     for direct in listed:
-        plain = direct.predicted(nominal)
+        plain = direct.predict(nominal)
         count = len(plain)
         columns = np.zeros((count, len(steps)))
         for k in np.flatnonzero(steps):
             if not _predict_alike(nominal, perturbed[k]):
-                columns[:, k] = (direct.predicted(perturbed[k]) - plain) / steps[k]
+                columns[:, k] = (direct.predict(perturbed[k]) - plain) / steps[k]
         channel = channels.index(direct.channel)
         padding = (0, count), (0, 0)
         window = replace(

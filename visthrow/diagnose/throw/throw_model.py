@@ -238,7 +238,7 @@ class ThrowModel(Model):
         flown = self._fly(setting, states)
         residuals = []
         for i, (w, residual) in enumerate(zip(self._retained, flown)):
-            direct = [d.values - d.predicted(setting) for d in self._direct.get(w, ())]
+            direct = [d.values - d.predict(setting) for d in self._direct.get(w, ())]
             residual = np.concatenate((residual, *direct))
             if i in moves:
                 residual = residual + linearised.windows[i].nuisance @ moves[i]
