@@ -1,1 +1,1 @@
-"""Inputs of a diagnosis: its setup, the logs, what was measured besides."""
+"""Inputs of a diagnosis: setup, logs, and measurements on the ground."""

@@ -1,4 +1,4 @@
-"""Columns of a foreign table by their names: which belong together, and in which unit."""
+"""Grouping of a foreign table's columns by their names, and units in the names."""
 
 import re
 from collections import defaultdict
@@ -16,7 +16,7 @@ NAMES = tables_beside(__file__, "column_names.toml")
 PATTERNS = {name: re.compile(text, re.IGNORECASE) for name, text in NAMES["patterns"].items()}
 HINTS = {kind: re.compile(text, re.IGNORECASE) for kind, text in NAMES["hints"].items()}
 WHOLE = ("012345678", "0123", "1234", "xyzw", "xyz")
-"""Components that make a matrix, motors or a quaternion, and a vector."""
+"""Components of complete groups: a matrix, motors or a quaternion, and a vector."""
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
 _BRACKETS = re.compile(r"^(.+?)\s*[\[(]\s*([^\d\[\]()][^\[\]()]*|)\s*[\])]$")
@@ -25,41 +25,41 @@ _NUMBERED = re.compile(r"^(.*?)[._\[]?([0-8])\]?$")
 
 @dataclass(eq=False)
 class Group:
-    """Columns that belong together."""
+    """Columns that belong together, such as the components of a vector."""
 
-    stem: str  # that their names share
+    stem: str  # common part of their names
     columns: tuple[str, ...]
     values: ndarray  # shape (T, number of columns)
-    unit: str = ""  # by their names, "" where these do not say
+    unit: str = ""  # stated by their names; "" if none is
 
     @property
     def listed(self) -> str:
-        """The columns for messages."""
+        """Return the columns as text for messages."""
         return ", ".join(self.columns)
 
     @property
     def middle(self) -> float:
-        """Median of the values."""
+        """Return the median of the values."""
         return float(np.nanmedian(self.values))
 
     @property
     def reach(self) -> float:
-        """Size within which 99 % of the values lie."""
+        """Return the 99th percentile of the absolute values."""
         return float(np.nanpercentile(np.abs(self.values), 99))
 
     def matches(self, pattern: str) -> bool:
-        """Tell whether what the names share matches a pattern of ``column_names.toml``."""
+        """Return whether the stem matches a pattern of ``column_names.toml``."""
         return bool(PATTERNS[pattern].search(self.stem))
 
     def hints_at(self, kind: str) -> bool:
-        """Tell whether the names hint at this kind, and at no other one but a position."""
+        """Return whether the stem hints at this kind, and at no other one but a position."""
         kinds = {name for name, pattern in HINTS.items() if pattern.search(self.stem)}
         return kind in kinds and kinds <= {kind, "position"}
 
 
 def groups_of(numbers: Table) -> list[Group]:
-    """Group columns by their names: whole vectors, quaternions, matrices and sets of motors, then
-    single ones.
+    """Group columns by their names into matrices, quaternions, sets of motors and vectors; the rest
+    are groups of one.
     """
     families = defaultdict(dict)
     for name in numbers:
@@ -81,7 +81,7 @@ def groups_of(numbers: Table) -> list[Group]:
             families[3, stem, "", behind].setdefault(NAMES["components"][letter], name)
     listed = []
     for (_, stem, _, unit), places in sorted(families.items(), key=lambda item: item[0][0]):
-        if stem == "motor" and len(places) > 4:  # outputs without a motor stand
+        if stem == "motor" and len(places) > 4:  # outputs without a motor are constant
             places = {
                 place: name for place, name in places.items() if moves(numbers[name][:, None])
             }
@@ -101,8 +101,8 @@ def groups_of(numbers: Table) -> list[Group]:
 
 
 def _stem_behind(letter: str, words: str) -> str:
-    """Return the stem of a name that begins with a component: what its words hint at, or else what
-    the component is of.
+    """Return the stem of a name that begins with a component: its other words, and the family of
+    the component unless the words already hint at a kind.
     """
     stem = f"{words}_"
     hinted = {kind for kind, pattern in HINTS.items() if pattern.search(stem)} - {"position"}
@@ -110,26 +110,26 @@ def _stem_behind(letter: str, words: str) -> str:
 
 
 def _last_unit(words: str) -> str:
-    """Return the unit that the last of several words is, "" where it is none."""
+    """Return the unit that the last of several words states, or ""."""
     *before, last = re.split(r"[._ ]+", words.lower())
     return NAMES["units"].get(last, "") if before else ""
 
 
 def moves(values: ndarray) -> bool:
-    """Tell whether rows of numbers, shape (T, columns), differ."""
+    """Return whether rows of numbers, shape (T, columns), change."""
     whole = values[np.all(np.isfinite(values), axis=1)]
     return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
 
 
 def rises(cells: ndarray) -> bool:
-    """Tell whether a column rises as a clock does."""
+    """Return whether a column rises like a clock."""
     steps = np.diff(cells[np.isfinite(cells)])
     return len(steps) > 10 and bool(np.all(steps >= 0.0)) and np.mean(steps > 0.0) > 0.3
 
 
 def _neighbours(numbers: Table) -> list[list[str]]:
-    """Group the columns of a table without a header: four of length 1, and threes of the others but
-    counters.
+    """Group adjacent columns of a table without header: four with norm 1 as a quaternion, others
+    in threes, without counters.
     """
     names = [
         name
@@ -152,7 +152,7 @@ def _neighbours(numbers: Table) -> list[list[str]]:
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Return a name without the unit in brackets at its end, and that unit, "" where none is."""
+    """Return a name without the unit in brackets at its end, and that unit, or ""."""
     match = _BRACKETS.match(name)
     if match is None:
         return name, ""
@@ -163,7 +163,7 @@ def split_unit(name: str) -> tuple[str, str]:
 
 
 def unit_by_name(name: str) -> str:
-    """Return the unit that a name says, in brackets or by its last word; "" where it says none."""
+    """Return the unit that a name states in brackets or by its last word, or ""."""
     unit = split_unit(name)[1]
     last = re.split(r"[^A-Za-z0-9]+", name.rstrip(")]} "))[-1].lower()
     words = [word.lower() for word in _SPLIT.split(name) if word] or [last]

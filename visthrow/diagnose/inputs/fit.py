@@ -1,8 +1,8 @@
-"""First values of one's own vehicle or motor from standalone flights or tests: all chosen effects
-at once, with covariance.
+"""Joint fit of effects for a first configuration of a vehicle or motor, from standalone flights or
+tests, with covariance.
 
-Where a diagnosis asks which cause is there, a fit takes for granted that all chosen ones are: their
-slabs are the only prior."""
+A diagnosis decides which effects are present; a fit assumes that all chosen ones are, with their
+slabs as the only prior."""
 
 import hashlib
 from collections import defaultdict
@@ -34,26 +34,24 @@ DEFAULT_FREE = {
     "imu": ("thrust_gain", "thrust_curve", "motor_tau", "cmd_delay", "inertia_xy", "inertia_z"),
     "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
 }
-"""Model -> effects that are fitted where none are named; what the logs cannot determine keeps
-its prior.
-"""
-ROUNDS = 4
-# an effect whose deviation is still this share of its prior was not determined by the logs
+"""Model -> effects to fit by default; those that the logs do not determine keep their prior."""
+ROUNDS = 4  # largest number of linearisations
+# posterior over prior standard deviation above which the logs do not determine an effect
 UNKNOWN_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class FitResult:
-    """Sizes of effects, with what is known of them."""
+    """Fitted sizes of effects with their covariance."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     theta: ndarray  # in the effects' units, shape (K,)
     covariance: ndarray  # shape (K, K)
-    identified: tuple[bool, ...]  # by the logs, not the prior
-    rms_before: Mapping[str, float]  # residual by channel, in its unit
+    identified: tuple[bool, ...]  # whether the logs determine an effect, rather than its prior
+    rms_before: Mapping[str, float]  # channel -> root mean square residual, in its unit
     rms_after: Mapping[str, float]
-    middle_speed: float = 0.0  # of a stand's steps, to which its linear part refers [rad/s]
+    middle_speed: float = 0.0  # of a stand's steps, the reference of its linear term [rad/s]
 
     @property
     def sentences(self) -> list[str]:
@@ -70,8 +68,8 @@ class FitResult:
 def fit(model: Model, free: Sequence[str]) -> FitResult:
     """Fit effects of a model jointly.
 
-    ``model``: linearisable; its windows' latent forces and noise levels are estimated on the way.
-    Raises DiagnoseError: a name that the model does not have, or none.
+    Latent forces and noise levels of the model's windows are estimated too.
+    Raises DiagnoseError: the model does not have an effect, or ``free`` is empty.
     """
     from visthrow.diagnose.select.point import Problem, fit, linearise
 
@@ -106,7 +104,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
 
 
 def _rms(model: Model, windows: Sequence[Window]) -> dict[str, float]:
-    """Return the residual of each channel that the windows hold, in its unit."""
+    """Return the root mean square residual of each channel in the windows, in its unit."""
     channel = np.concatenate([w.channel for w in windows])
     squares = np.concatenate([w.residual for w in windows]) ** 2
     return {
@@ -117,11 +115,11 @@ def _rms(model: Model, windows: Sequence[Window]) -> dict[str, float]:
 
 
 def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleParams:
-    """A simulated vehicle with what was found; everything else as in ``base``.
+    """Return the parameters of a simulated vehicle with the fitted values; others as in ``base``.
 
-    A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest
-    thrust follows the map. ``base``: vehicle that lends all other numbers. Raises DiagnoseError:
-    the setup's model is of no vehicle."""
+    A map from commands to thrust does not determine rotor speeds: the thrust coefficient is then
+    that of ``base``, and the largest thrust is the map's. Raises DiagnoseError: the setup's model
+    is of no vehicle."""
     size = defaultdict(float, zip(result.names, map(float, result.theta)))
     if setup.flyer is not None:
         return _vehicle_of_flyer(setup.flyer, size, base)
@@ -157,7 +155,7 @@ def _vehicle_of_flyer(p: Any, size: Sizes, base: VehicleParams) -> VehicleParams
         "queue.delay": max(p.command_delay + size["cmd_delay"], 0.0),
     }
     if p.input == "motor_speed":
-        # the curve's departure in thrust is taken at hover, where it is measured
+        # the curve's change of thrust refers to hover, where it is measured
         values["thrust.k_f"] = p.thrust_map[2] * gain
         values["thrust.k_1"] = p.thrust_map[1] * gain
     elif p.input == "motor_command":
@@ -177,8 +175,8 @@ def write(
     logs: Sequence[FlightLog],
     base: VehicleParams,
 ) -> list[Path]:
-    """Write ``vehicle.toml`` (where the model is one of a vehicle) and ``fit.json`` with covariance
-    and provenance.
+    """Write ``fit.json`` with covariance and provenance, and ``vehicle.toml`` if the model is of a
+    vehicle or motor.
 
     Returns their paths. Raises StorageError: the folder cannot be written.
     """
@@ -206,13 +204,13 @@ def _head(name: str, result: FitResult, sources: Mapping[str, str]) -> str:
 
 
 def list_covariance(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:
-    """Return the comments that hold a covariance."""
+    """Return the lines of a comment that state a covariance."""
     rows = [f"  {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
     return [f"covariance of {', '.join(names)}:", *rows] if names else []
 
 
 def _digest(log: FlightLog) -> str:
-    """Fingerprint of a log's samples."""
+    """Return a fingerprint of a log's samples."""
     digest = hashlib.sha256()
     for name in sorted(log.channels):
         channel = log[name]

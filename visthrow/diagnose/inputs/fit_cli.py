@@ -1,5 +1,5 @@
-"""``visthrow diagnose fit``: the first configuration of one's own vehicle or motor, from standalone
-flights or tests.
+"""``visthrow diagnose fit``: fit a first configuration of a vehicle or motor to standalone flights
+or tests.
 """
 
 import argparse
@@ -11,7 +11,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, check, fit, write."""
+    """Read and check the logs, fit the effects, print and write the result."""
     from sim.params import VehicleParams
     from visthrow import config
     from visthrow.common.storage import write_json

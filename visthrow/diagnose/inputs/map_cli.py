@@ -1,5 +1,5 @@
-"""``visthrow diagnose map``: a proposed mapping of a foreign table's columns, as TOML, with what it
-could not know as questions.
+"""``visthrow diagnose map``: propose a mapping of a foreign table's columns as TOML, with questions
+where it is uncertain.
 """
 
 import argparse
@@ -12,7 +12,7 @@ add_arguments = declare(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, propose, print."""
+    """Read the file, propose a mapping, print and write it."""
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.inputs.proposal import propose, propose_model
     from visthrow.logs import read, table_of, takes_mapping

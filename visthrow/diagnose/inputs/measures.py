@@ -1,8 +1,5 @@
-"""What a scale, a tape or a barometer settles that no flight does: measured values narrow the
-catalogue.
-"""
+"""Measurements on the ground, by a scale, a tape or a barometer, which narrow priors of effects."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,42 +8,41 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.models.model_interface import Effect
 
-# deviations of a measurement beyond which the configured value cannot be off
+# largest error of a measured value, in the measurement's standard deviations
 CERTAIN_DEVIATIONS = 3.0
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measurement on the ground."""
+    """A measurement on the ground."""
 
-    name: str  # what to do
-    effect: str  # that it settles
-    sd: float  # of the measured value, in the effect's unit
-    seconds: float
-    file = ""  # no reference is flown
+    name: str  # instruction
+    effect: str  # effect whose size it determines
+    sd: float  # standard deviation of the measured value, in the effect's unit
+    seconds: float  # time that it takes
+    file = ""  # a measurement has no reference to fly
 
     @property
     def purpose(self) -> str:
-        """Return what it is for, in words."""
+        """Return the purpose in words."""
         return f"settles {self.effect}"
 
     def limits(self) -> str:
-        """Return when to abort: never."""
+        """Return the limits beyond which to abort: none."""
         return ""
 
 
-RIGHT = 1e-3  # deviation of a value that is stated to be right, in what is negligible
+RIGHT = 1e-3  # standard deviation of a value that is stated to be exact, in floors
 
 MEASUREMENTS = tuple(Measurement(name, **row) for name, row in tables_beside(__file__).items())
 
 
 def narrow(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Effect, ...]:
-    """The catalogue where some configured values were measured.
+    """Return the catalogue with narrower priors for effects whose configured values were measured.
 
-    ``measured``: effect -> deviation of the measurement that the configuration's value comes from,
-    in its unit.
-    A deviation of 0 says that the configured value is right, such as ``wind_x=0`` in a hall. Raises
-    DiagnoseError: no effect of that name, or a deviation below 0."""
+    ``measured``: effect -> standard deviation of the measurement behind the configured value, in
+    the effect's unit; 0 states that the configured value is exact, such as ``wind_x=0`` in a hall.
+    Raises DiagnoseError: no effect of that name, or a standard deviation below 0."""
     expect_known(
         measured,
         [e.name for e in effects],
@@ -55,7 +51,9 @@ def narrow(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Ef
     )
     for name, sd in measured.items():
         if not sd >= 0.0:
-            raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected 0 or more")
+            raise DiagnoseError(
+                f"{name} measured with a standard deviation of {sd}; expected 0 or more"
+            )
     changed = []
     for effect in effects:
         sd = measured.get(effect.name, np.inf) or RIGHT * effect.floor
@@ -67,9 +65,9 @@ def narrow(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[Ef
 
 
 def parse(items: Sequence[str]) -> dict[str, float]:
-    """Read ``NAME=DEVIATION`` of the command line, several by commas.
+    """Parse ``NAME=DEVIATION`` of the command line, several separated by commas.
 
-    Raises DiagnoseError: something else."""
+    Raises DiagnoseError: an item has another form."""
     out = {}
     for item in ",".join(items).split(",") if items else ():
         name, _, sd = item.partition("=")

@@ -1,4 +1,4 @@
-"""From command line arguments to a model: which logs, read how, held against which simulation."""
+"""Command line arguments of the diagnosis: from them, logs and the model to compare them with."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -18,23 +18,23 @@ from visthrow.logs.check.run import check, label
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_PLANT = "state"
-THROW = "throw"  # name of the model that is no setup's own: the whole throw
+THROW = "throw"  # name of the throw's model, for which a setup has no table
 
 
 add_arguments = declare(__file__)
 
 
 class Opened:
-    """Logs, and the model of them once it is asked for.
+    """The logs of a command, and the model of them, built when first used.
 
     Attributes:
-        logs: as they were read; once the model is built, with their commands corrected.
+        logs: the logs as read; once the model is built, with commands corrected.
     """
 
     def __init__(self, args: argparse.Namespace):
         """Read the logs.
 
-        Raises ConfigError, LogError: as what is read."""
+        Raises ConfigError, LogError: from :func:`visthrow.diagnose.inputs.setup.read_logs`."""
         self._args = args
         self.logs = setup.read_logs(args.logs, args.config)
 
@@ -42,8 +42,8 @@ class Opened:
     def model(self) -> Model:
         """Build the model.
 
-        Raises ConfigError, LogError, DiagnoseError: as what is built; ``--set`` with a setup's own
-        model."""
+        Raises ConfigError, LogError, DiagnoseError: the model cannot be built, or ``--set`` is used
+        with a setup's model."""
         args = self._args
         logs = self.logs
         chosen = setup.load(args.config)
@@ -60,7 +60,7 @@ class Opened:
                 model.choose(args.only)
         if args.measured:
             model.effects = measures.narrow(model.effects, measures.parse(args.measured))
-        # day of each flight, from 0: what its log says, else those of one folder are of one
+        # index of each flight's day: by the log's entry, or one day for each folder
         names = [
             str(log.meta.get("day") or Path(str(log.meta.get("source", ""))).parent) for log in logs
         ]
@@ -69,12 +69,12 @@ class Opened:
 
     @property
     def known(self) -> KnownVehicle:
-        """Return what is known of the vehicle."""
+        """Return the known properties of the vehicle, for checking logs."""
         vehicle = setup.describe_vehicle(self._args.config)
         return replace(vehicle, unread=vehicle.unread.union(self._args.overrule))
 
     def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
-        """Diagnose the flights, as the arguments say."""
+        """Diagnose the flights with the options of the command line."""
         without = numbers(self._args.without, self.logs)
         if self._args.overrule:
             rows = [row for log in check(self.logs, self.known) for row in log.rows]
@@ -93,15 +93,15 @@ class Opened:
             return diagnosis
         note = (
             f"--only left {self.model.not_offered} effects out: one of them may be the true cause"
-            " behind what is named here"
+            " instead of those found"
         )
         return replace(diagnosis, reasons=(*diagnosis.reasons, note))
 
 
 def describe_origin(args: argparse.Namespace) -> dict[str, Any]:
-    """Entries of a diagnosis' JSON that say what was diagnosed:
+    """Return the entries of a diagnosis' JSON that state what was diagnosed.
 
-    ``apply`` builds on nothing else.
+    ``apply`` uses them to find the diagnosed configuration.
     """
     return {
         "model": setup.load(args.config).model or THROW,
@@ -114,8 +114,8 @@ def describe_origin(args: argparse.Namespace) -> dict[str, Any]:
 def throw_model(
     args: argparse.Namespace, logs: Sequence[FlightLog]
 ) -> tuple[Model, list[FlightLog]]:
-    """The whole throw, with the plant of an experiment, and its logs with their
-    commands put right.
+    """Build the throw's model with the plant of an experiment; return it with the logs after
+    mistakes in their commands were corrected.
     """
     from visthrow.common.compute_device import resolve_for_warp
     from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -138,9 +138,9 @@ def throw_model(
 
 
 def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
-    """Flights named on the command line.
+    """Parse the numbers of the flights to leave out.
 
-    Raises DiagnoseError: no numbers between commas, no such flight, or all of them.
+    Raises DiagnoseError: other text than numbers, no such flight, or all of them.
     """
     try:
         flights = tuple(int(part) for part in text.split(",") if part.strip())

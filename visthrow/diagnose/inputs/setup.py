@@ -1,6 +1,4 @@
-"""A diagnosis setup: how logs are read, which simulation they are held against, and its
-parameters.
-"""
+"""A diagnosis setup: how to read logs, and the model to compare them with."""
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
@@ -21,36 +19,33 @@ from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
-VELOCITIES = frozenset({"vel_w", "vel_b", "payload_vel_w"})  # which no model of a vehicle reads
+VELOCITIES = frozenset({"vel_w", "vel_b", "payload_vel_w"})  # not used by any vehicle's model
 MODELS: dict[str, Any] = {
     "ball": BallModel,
     "stand": StandModel,
     "flyer": FlyerModel,
     "imu": ImuModel,
 }
-"""Table of a setup -> the model that it parametrises."""
+"""Table of a setup -> model whose parameters it holds."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """File of ``configs/diagnose``; at most one of the models.
+    """A file of ``configs/diagnose``, with at most one of the models.
 
     Raises ConfigError: more than one model.
     """
 
-    about: str  # whose logs these are
-    example: str = ""  # folder of the program that holds the model, where no table does
-    table: TableMap | None = (
-        None  # of tables' columns; None: the logs say themselves what they hold
-    )
+    about: str  # origin of the logs
+    example: str = ""  # folder of the program that holds the model, if none of the tables does
+    table: TableMap | None = None  # mapping of columns; None: logs describe their own contents
     ball: BallParams | None = None
     stand: StandParams | None = None
     flyer: FlyerParams | None = None
     imu: ImuParams | None = None
-    effects: dict[str, float] = field(
-        default_factory=dict
-    )  # sizes that a diagnosis found, written by apply
-    laws: tuple[LawParams, ...] = ()  # likewise
+    # sizes that a diagnosis found, written by apply
+    effects: dict[str, float] = field(default_factory=dict)
+    laws: tuple[LawParams, ...] = ()  # laws that a diagnosis found, written by apply
 
     def __post_init__(self) -> None:
         named = [name for name in MODELS if getattr(self, name) is not None]
@@ -59,15 +54,15 @@ class Setup:
 
     @property
     def model(self) -> str:
-        """Name of the model that has a table; empty where none has."""
+        """Name of the model that has a table, or "" if none has."""
         return next((name for name in MODELS if getattr(self, name) is not None), "")
 
 
 def model_of(setup: Setup, logs: Sequence[FlightLog]) -> NumericModel:
-    """Make the model that a setup holds logs against.
+    """Build a setup's model of logs.
 
-    Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an
-    effect or law is none of the model's."""
+    Raises ConfigError: the setup has no model; LogError: the logs hold no data for the model, or
+    the model does not have an effect or law of the setup."""
     if not setup.model and setup.example:
         raise ConfigError(
             f"the setup '{setup.about}' only reads the columns; its model is a program of the"
@@ -84,10 +79,9 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> NumericModel:
 
 
 def load(name: str | Path | None) -> Setup:
-    """Load a setup by its name in ``configs/diagnose``, or a file; without a name one that states
-    nothing.
+    """Load a setup by its name in ``configs/diagnose``, or a file; without a name, an empty setup.
 
-    Raises ConfigError: there is none, or it does not fill the schema.
+    Raises ConfigError: there is no such setup, or it does not match the schema.
     """
     if name is None:
         return Setup("")
@@ -95,11 +89,10 @@ def load(name: str | Path | None) -> Setup:
 
 
 def describe_vehicle(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
-    """Return what a setup, or the plant of an experiment, says of the vehicle.
+    """Return the known properties of a vehicle, from a setup or the plant of an experiment.
 
-    ``name``: of a setup, or None; ``plant``: of configs/train, or a file; asked only where the
-    setup has no flying model.
-    Raises ConfigError: as :func:`load`.
+    ``name``: of a setup, or None; ``plant``: name in configs/train or a file, used only if the
+    setup has no flying model. Raises ConfigError: from :func:`load`.
     """
     setup = load(name)
     if (imu := setup.imu) is not None:
@@ -122,11 +115,11 @@ def describe_vehicle(name: str | Path | None, plant: str | None = None) -> Known
 def read_logs(
     paths: Sequence[str | Path], name: str | Path | None = None, models: Container[str] = MODELS
 ) -> list[FlightLog]:
-    """Read logs, tables by the mapping of the setup ``name``.
+    """Read logs; tables by the mapping of the setup ``name``.
 
-    ``models``: those that make a setup of use for logs that are no tables.
-    Raises LogError, ConfigError: as the readers and :func:`load`; ConfigError: no log is a table,
-    and the setup is for tables alone."""
+    ``models``: models for which a setup is useful although no log is a table. Raises LogError,
+    ConfigError: from the readers and :func:`load`; ConfigError: no log is a table, and the setup is
+    only for tables."""
     chosen = load(name)
     logs = read_all(paths, chosen.table)
     of_use = chosen.table is None or chosen.model in models
