@@ -1,5 +1,6 @@
 """Measurements on the ground, by a scale, a tape or a barometer, which narrow priors of effects."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -105,7 +105,7 @@ def write_report(
     """Print the summary, and write JSON, page, pictures and recording.
 
     ``limits``: whether to compute the detection limits; ``made_with``: see
-    :func:`visthrow.diagnose.inputs.model_arguments.made_with`. Returns the gain on held-out
+    :func:`visthrow.diagnose.inputs.model_arguments.describe_origin`. Returns the gain on held-out
     flights; None where no window can be predicted.
     """
     from visthrow.diagnose.reporting import recording
