@@ -1,12 +1,12 @@
-"""The functions that tensors and NumPy arrays share: one piece of code serves a batch in training
-and the single row on board.
+"""Functions that accept both tensors and NumPy arrays, so that a batch in training and a single row
+on board use the same code.
 
 A history is newest first. Its functions neither index by masks nor branch on data, so that they run
-inside a CUDA graph. On reset it is filled with the first value: so it never mixes two episodes and
-never holds zeros that were no measurement.
+inside a CUDA graph. On reset the history is filled with the first value: it never mixes two
+episodes and never holds zeros that were not measured.
 
-On one row NumPy takes a fraction of torch's time. Both give the same bits: sums, products,
-quotients and roots round alike, and angles are torch's own."""
+For one row, NumPy takes a fraction of torch's time. Both give the same bits: sums, products,
+quotients and roots round identically, and trigonometric functions are torch's in both."""
 
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
@@ -17,16 +17,16 @@ import torch
 from torch import Tensor
 
 Array = Any
-"""A tensor or an array; what a function returns is of the kind of its arguments."""
+"""A tensor or an array. A function returns the type of its arguments."""
 
 
 def wrap_for_arrays(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
-    """Return a function of tensors as one of arrays."""
+    """Wrap a function of tensors for arrays."""
     return lambda *arrays: function(*map(torch.from_numpy, arrays)).numpy()
 
 
 class ArrayFunctions:
-    """The functions of arrays, under the names that torch has for them."""
+    """NumPy functions under torch's names."""
 
     asarray = np.asarray
     broadcast_to = np.broadcast_to
@@ -48,12 +48,12 @@ class ArrayFunctions:
 
 
 def library(array: Tensor | np.ndarray) -> Any:
-    """Return where the functions of a tensor or an array are: torch, or `ArrayFunctions`."""
+    """Return the library of a tensor's or array's functions: torch or `ArrayFunctions`."""
     return torch if isinstance(array, Tensor) else ArrayFunctions
 
 
 def push(history: Array, new: Array, reset_mask: Array) -> Array:
-    """Return the history with a value put in front and the oldest dropped.
+    """Return the history with a new value prepended and the oldest dropped.
 
     Args:
         history: Shape (E, H, ...), newest first.
@@ -70,10 +70,10 @@ def push(history: Array, new: Array, reset_mask: Array) -> Array:
 
 
 def interpolate_at_latency(history: Tensor, latency: Tensor) -> Tensor:
-    """Value that is ``latency`` steps old, linear between the two stored neighbours.
+    """Return the value that is ``latency`` steps old, interpolated between its two neighbours.
 
-    Written as hat-function weights over the whole (short) history: no gather, latencies may differ
-    by environment. A latency beyond the history reads its oldest value.
+    The sum over the whole (short) history is weighted by hat functions: it needs no gather, and
+    latencies may differ by environment. A latency beyond the history gives its oldest value.
 
     Args:
         history: Floating point, shape (E, H, ...), newest first.
@@ -91,16 +91,19 @@ def interpolate_at_latency(history: Tensor, latency: Tensor) -> Tensor:
 
 
 def latency_weights(length: int, latency: Tensor, like: Tensor) -> Tensor:
-    """Weight of each stored age: shape (E, H), rows sum to 1; (1, H) for a scalar latency."""
+    """Return the weight of each stored age, shape (E, H), or (1, H) for a scalar latency. Rows sum
+    to 1.
+    """
     ages = torch.arange(length, device=like.device, dtype=like.dtype)
     age = latency.to(like.dtype).reshape(-1, 1).clamp(0.0, length - 1.0)
     return (1.0 - (ages - age).abs()).clamp(min=0.0)
 
 
 def redraw(buffers: Mapping[str, Tensor], spreads: Mapping[str, float], fresh: Tensor) -> None:
-    """Draw each buffer, shape (E, ...), anew where an episode begins, bool, shape (E,), as normal
-    noise with its deviation; 0 leaves it as it is.
-    """
+    """Redraw buffers, shape (E, ...), in environments whose episode begins.
+
+    ``spreads``: standard deviation of each buffer's normal noise; 0 leaves the buffer unchanged.
+    ``fresh``: environments, bool, shape (E,)."""
     for name, std in spreads.items():
         if std > 0.0:
             old = buffers[name]

@@ -1,7 +1,7 @@
-"""Bounds of numbers, declared where the field is:
+"""Bounds of the numbers of dataclasses, declared in the annotations of their fields:
 
 ``lag: NotNegative``, ``angle: Annotated[float, Bound(0.0, 180.0)]``. A number without a bound must
-be finite. Onboard-safe.
+be finite. The module may be imported on board.
 """
 
 import math
@@ -14,14 +14,14 @@ from typing import Annotated, Any, ClassVar
 
 @dataclass(frozen=True)
 class Bound:
-    """An interval; of a tuple every number lies in it, None passes."""
+    """An interval. Every number of a tuple must lie in it; None is accepted."""
 
     low: float = -math.inf
     high: float = math.inf
-    ends: str = "[]"  # as intervals are written: "(" and ")" leave an end out
+    ends: str = "[]"  # "(" or ")" excludes an end
 
     def holds(self, value: float) -> bool:
-        """Whether a finite number lies within."""
+        """Return whether a number is finite and inside the interval."""
         if self.ends[0] == "(":
             above = value > self.low
         else:
@@ -46,18 +46,20 @@ NotNegative = Annotated[float, Bound(0.0)]
 Vector = tuple[float, float, float]  # of numbers along three axes
 NotNegativeVector = tuple[NotNegative, NotNegative, NotNegative]
 Share = Annotated[float, Bound(0.0, 1.0)]
-# Of anything that flies in a hall: what lies beyond is a wrong unit.
+# Bounds for anything that flies in a hall: a number outside has a wrong unit.
 Mass = Annotated[float, Bound(0.0, 1e5, "(]")]  # [kg]
 Length = Annotated[float, Bound(0.0, 1e3, "(]")]  # [m]
 Arm = Annotated[float, Bound(-10.0, 10.0)]  # of a rotor [m]
 Duration = Annotated[float, Bound(0.0, 5.0, "(]")]  # of a filter, a lag or a step [s]
-Lag = Annotated[float, Bound(0.0, 5.0)]  # the same, or none [s]
-Drag = Annotated[float, Bound(0.0, 10.0)]  # over speed [kg/s] or over its square [kg/m]
-AirCoefficient = Annotated[float, Bound(-10.0, 10.0)]  # of another effect of the air, in SI units
+Lag = Annotated[float, Bound(0.0, 5.0)]  # a duration that may be 0 [s]
+Drag = Annotated[float, Bound(0.0, 10.0)]  # force over speed [kg/s] or its square [kg/m]
+AirCoefficient = Annotated[float, Bound(-10.0, 10.0)]  # of any other air force, in SI units
 
 
 class BoundedFields:
-    """Base of dataclasses whose annotations state bounds; raises `error` for a number outside."""
+    """Base of dataclasses with bounds in their annotations. Raises `error` for a number outside
+    its bounds.
+    """
 
     error: ClassVar[type[Exception]] = ValueError
 
@@ -69,7 +71,7 @@ class BoundedFields:
 
 
 def _numbers(value: Any) -> Iterator[float]:
-    """Yield the numbers in a value of a field."""
+    """Yield all numbers in the value of a field."""
     if isinstance(value, tuple | list | dict):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _numbers(item)

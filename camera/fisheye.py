@@ -1,10 +1,10 @@
-"""Kannala-Brandt fisheye model on tensors and arrays: valid past 90 deg off the axis, finite and
+"""Kannala-Brandt fisheye model on tensors and arrays, valid beyond 90 deg off the axis, finite and
 differentiable on the whole sphere.
 
-The same functions serve a batch of thousands on a GPU inside a CUDA graph and a batch of one on
-board: no host copies, no branches on data, no boolean-mask indexing. Only elementwise operations
-whose vector and scalar paths agree are used (``atan``, not ``atan2``, whose remainder loop rounds
-otherwise), so that a batch of N equals N singles bit for bit on the CPU."""
+The functions run on a batch of thousands inside a CUDA graph and on a single row on board: they
+make no host copies, do not branch on data and do not index by boolean masks. They use only
+elementwise operations whose vectorised and scalar code round identically (``atan``, but not
+``atan2``), so that a batch of N equals N single calls bit for bit on the CPU."""
 
 from typing import Any
 
@@ -19,8 +19,7 @@ points' unit.
 """
 
 NEWTON_STEPS = 16
-"""Safeguarded Newton steps of the inverse: bisection where a Newton step would leave the bracket.
-"""
+"""Safeguarded Newton steps of the inverse, with bisection if a step would leave the bracket."""
 
 
 class Fisheye:
@@ -31,20 +30,20 @@ class Fisheye:
     theta_d(fov / 2)``. They do not depend on fx, fy, cx, cy at all, only on the shape of theta_d
     and the field of view.
 
-    Past the field of view theta_d goes on along its tangent, so that the map stays one-to-one and
-    smooth on the whole sphere even where the polynomial folds back; such points are never valid.
+    Beyond the field of view theta_d continues along its tangent, so that the map is one-to-one and
+    smooth on the whole sphere even if the polynomial folds back. Such points are never valid.
     Results have the dtype and device of the input.
 
     Attributes:
         params: The intrinsics.
         half_fov: Largest valid angle off the axis [rad].
         edge_radius: ``R = theta_d(fov / 2)`` [rad].
-        circle_inside_image: Whether the whole field of view falls on the sensor; if not, validity
-            also asks for the image.
+        circle_inside_image: Whether the whole field of view is on the sensor. If not, a valid point
+            must also be on the sensor.
     """
 
     def __init__(self, params: FisheyeParams):
-        """Keep what projection and its inverse need of the intrinsics."""
+        """Precompute the constants of projection and its inverse."""
         self.params = params
         self.half_fov = params.half_fov
         self._equidistant = not any(params.coefficients)
@@ -64,7 +63,7 @@ class Fisheye:
         self._constants: dict[tuple[Any, Any], tuple[Any, Any]] = {}
 
     def angle(self, points_c: Array, epsilon: float = AXIS_EPSILON) -> tuple[Array, Array, Array]:
-        """Angle off the optical axis of points.
+        """Return the angles of points off the optical axis.
 
         Args:
             points_c: Points [any unit], shape (..., 3), camera frame.
@@ -80,14 +79,14 @@ class Fisheye:
         radius = xp.sqrt(radius2)
         distance = xp.sqrt(radius2 + z * z)
         backward = z < 0.0
-        # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each
-        # side of the lens plane.
+        # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): each side of the lens plane uses the
+        # form without cancellation.
         reach = distance + abs(z)
         tangent = xp.where(backward, reach, radius) / xp.where(backward, radius, reach)
         return xp.atan(tangent) * 2.0, radius, distance
 
     def radius_from_angle(self, theta: Array) -> Array:
-        """theta_d [rad], shape of theta; past the field of view it goes on along its tangent."""
+        """Return theta_d [rad], shape of theta; beyond the field of view it follows its tangent."""
         if self._equidistant:
             return theta
         k1, k2, k3, k4 = self.params.coefficients
@@ -97,7 +96,7 @@ class Fisheye:
         return radius + (theta - inner) * self._edge_slope
 
     def slope_from_angle(self, theta: Array) -> Array:
-        """d theta_d / d theta [-], shape of theta; constant past the field of view."""
+        """Return d theta_d / d theta [-], shape of theta; constant beyond the field of view."""
         if self._equidistant:
             return library(theta).ones_like(theta)
         k1, k2, k3, k4 = self.params.coefficients
@@ -110,8 +109,8 @@ class Fisheye:
 
         Args:
             points_c: Points [any unit], shape (..., 3), camera frame.
-            clip: Pull points outside the field of view to its edge (radius 1), along their own
-                direction in the image.
+            clip: Move points outside the field of view to its edge (radius 1) along their direction
+                in the image.
 
         Returns:
             Normalised coordinates [-], shape (..., 2), and validity (bool), shape (...): inside the
@@ -133,7 +132,7 @@ class Fisheye:
 
         Returns:
             Pixels [px], shape (..., 2), finite everywhere, and validity (bool), shape (...): theta
-            <= fov / 2. Whether a valid point also falls on the sensor is `is_on_sensor`'s to say.
+            <= fov / 2. `is_on_sensor` tests whether a valid point is also on the sensor.
         """
         theta, radius, _ = self.angle(points_c)
         focal, centre = self._pixel_constants(points_c)
@@ -148,40 +147,40 @@ class Fisheye:
 
         Returns:
             Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside
-            the field of view. Pixels beyond it give the ray at the edge.
+            the field of view. A pixel beyond the field of view gives the ray at its edge.
         """
         xp = library(pixels)
         focal, centre = self._pixel_constants(pixels)
         plane = (pixels - centre) / focal
         x, y = plane[..., 0], plane[..., 1]
         radius = xp.sqrt(x * x + y * y + AXIS_EPSILON)
-        # A ray that was projected from the very edge may round to either side of it.
+        # the projection of a ray at the edge may round to either side of it
         valid = radius <= self.edge_radius * (1.0 + 8.0 * float(xp.finfo(pixels.dtype).eps))
         theta = self._angle_from_radius(radius.clip(max=self.edge_radius))
         lateral = plane * (xp.sin(theta) / radius)[..., None]
         return xp.concatenate([lateral, xp.cos(theta)[..., None]], -1), valid
 
     def normalize(self, pixels: Array) -> Array:
-        """Normalised image coordinates [-] of pixels [px], both shape (..., 2)."""
+        """Convert pixels [px] to normalised image coordinates [-], both shape (..., 2)."""
         focal, centre = self._pixel_constants(pixels)
         return (pixels - centre) / (focal * self.edge_radius)
 
     def denormalize(self, normalized: Array) -> Array:
-        """Pixels [px] of normalised image coordinates [-], both shape (..., 2)."""
+        """Convert normalised image coordinates [-] to pixels [px], both shape (..., 2)."""
         focal, centre = self._pixel_constants(normalized)
         return normalized * (focal * self.edge_radius) + centre
 
     def is_on_sensor(self, pixels: Array) -> Array:
-        """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
-        bool, shape (...).
+        """Return whether pixels [px], shape (..., 2), are on the sensor including the outer pixels'
+        edges: bool, shape (...).
         """
         low, right, top, bottom = self._bounds
         u, v = pixels[..., 0], pixels[..., 1]
         return (u >= low) & (u <= right) & (v >= top) & (v <= bottom)
 
     def _angle_from_radius(self, radius: Array) -> Array:
-        """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last
-        step.
+        """Invert theta_d by Newton's method inside a shrinking bracket; differentiable through the
+        last step.
         """
         if self._equidistant:
             return radius
@@ -199,8 +198,8 @@ class Fisheye:
         return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
 
     def _pixel_constants(self, like: Array) -> tuple[Array, Array]:
-        """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be
-        captured later.
+        """Return focal lengths and principal point on a tensor's device. They are cached, because
+        they cannot be created while a CUDA graph is captured.
         """
         key = (like.device, like.dtype)
         if key not in self._constants:

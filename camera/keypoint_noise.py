@@ -1,9 +1,9 @@
-"""Imperfections of a keypoint detector: noise, per-episode bias, drop-out, latency, and what an
-invalid point reads.
+"""Errors of a keypoint detector: noise, bias of an episode, drop-outs, latency, and the values of
+invalid keypoints.
 
-The randomness is an argument: the functions that apply it are pure, so that a CUDA graph can replay
-them on refilled buffers and the HIL runner can pass zeros. :class:`DetectorView` draws it for a
-batch of simulated cameras."""
+Random numbers are arguments. The functions are pure, so that a CUDA graph can replay them on
+refilled buffers and the HIL runner can pass zeros. :class:`DetectorView` draws the random numbers
+for a batch of simulated cameras."""
 
 from typing import NamedTuple
 
@@ -16,11 +16,11 @@ from camera.params import CameraParams, KeypointNoiseParams
 
 
 class StepDraw(NamedTuple):
-    """Randomness of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape (E,
-    K).
+    """Random numbers of one step: standard normals, shape (E, K, 2), and uniforms in [0, 1), shape
+    (E, K).
 
-    ``wrong``: uniforms of wrong points, shape (E, K, 3): whether, and where; None where there are
-    none."""
+    ``wrong``: uniforms that decide whether a keypoint is wrong and where it is, shape (E, K, 3);
+    None if no keypoint can be wrong."""
 
     normals: Tensor
     uniforms: Tensor
@@ -34,23 +34,23 @@ def apply_noise(
     bias: Tensor,
     draw: StepDraw,
 ) -> tuple[Tensor, Tensor]:
-    """Add noise and bias, drop points out, and set what invalid points read.
+    """Add noise and bias, drop keypoints out, and set the values of invalid keypoints.
 
     Args:
-        params: Spreads and the rule for invalid points.
+        params: Standard deviations and the rule for invalid keypoints.
         keypoints: Exact keypoints [-], shape (E, K, 2), normalised; with ``invalid_reads = "edge"``
             clipped to the edge.
         valid: Shape (E, K), bool.
-        bias: Of this episode [-], shape (E, K, 2).
-        draw: Randomness of this step.
+        bias: Bias of this episode [-], shape (E, K, 2).
+        draw: Random numbers of this step.
 
     Returns:
-        What the detector reports [-], shape (E, K, 2), and its validity bits, shape (E, K).
+        Keypoints as the detector reports them [-], shape (E, K, 2), and validity, shape (E, K).
     """
     noisy = keypoints + bias + draw.normals * params.step_std
     detected = draw.uniforms >= params.drop_probability
     visible = valid & detected
-    # Clipped points carry no noise: they are a rule, not a measurement.
+    # clipped points have no noise: they are not measured
     if params.invalid_reads == "edge":
         unseen = keypoints * detected.unsqueeze(-1)
     else:
@@ -64,7 +64,7 @@ def apply_noise(
 
 
 def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tuple[Tensor, Tensor]:
-    """Keypoints as they were ``latency`` steps ago.
+    """Return the keypoints of ``latency`` steps ago.
 
     Args:
         history: Keypoints [-], shape (E, H, K, 2), newest first (`camera.arrays.push`).
@@ -72,7 +72,7 @@ def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tu
         latency: Age [policy steps], shape (E,) or scalar tensor.
 
     Returns:
-        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): every entry that the
+        Keypoints [-], shape (E, K, 2), and validity, shape (E, K): whether every entry that the
         interpolation used was valid.
     """
     used = latency_weights(history.shape[1], latency, history) > 0.0
@@ -86,12 +86,12 @@ class DetectorView:
     """
 
     def __init__(self, params: CameraParams, like: Tensor):
-        """Allocate; ``like``: shape (E, ...), gives count and device."""
+        """Allocate buffers; ``like``: a tensor of shape (E, ...) on their device."""
         self._params = params
         self.camera = KeypointCamera(params, str(like.device))
         self.correction: tuple[Tensor, Tensor] | None = None
-        """Turns of the cameras [rad], shape (E, 3), and errors of their focal lengths [-], shape
-        (E,), that a calibration estimated."""
+        """Estimates of a calibration: the cameras' rotation errors [rad], shape (E, 3), and
+        relative errors of their focal lengths [-], shape (E,)."""
         E = len(like)
         depth = params.noise.history_length
         self._latency = like.new_tensor(params.noise.latency)
@@ -107,7 +107,7 @@ class DetectorView:
         }
 
     def begin(self, fresh: Tensor) -> None:
-        """Draw the errors of the episodes that begin."""
+        """Draw the errors of the episodes that begin; ``fresh``: their environments, shape (E,)."""
         noise = self._params.noise
         mount = self._params.mount
         spreads = {
@@ -119,7 +119,7 @@ class DetectorView:
         redraw(self.buffers, spreads, fresh)
 
     def _extrinsics(self) -> tuple[Tensor, Tensor] | None:
-        """Return the mounts of these episodes' cameras; None where all are nominal."""
+        """Return the extrinsics of the cameras in these episodes; None if all are nominal."""
         mount = self._params.mount
         if mount.rotation_error_std == 0.0 and mount.position_error_std == 0.0:
             return None

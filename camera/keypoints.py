@@ -1,8 +1,8 @@
-"""Keypoints that the vision policy sees: corners of the goal square and the bounding box of the
-ball.
+"""Keypoints of the vision policy: corners of the goal square and the bounding box of the ball.
 
-`keypoints` serves the training environment with a batch of thousands. For the single vehicle of the
-HIL runner, `visthrow.onboard.row_keypoints` computes the same on arrays."""
+`keypoints` computes them for a batch of thousands in the training environment;
+`visthrow.onboard.row_keypoints` computes them on arrays for the single vehicle of the HIL runner.
+"""
 
 import copy
 
@@ -17,32 +17,31 @@ from camera.params import CameraParams
 GOAL_KEYPOINTS = 4
 PAYLOAD_KEYPOINTS = 4
 KEYPOINTS = GOAL_KEYPOINTS + PAYLOAD_KEYPOINTS
-"""K = 8 keypoints: 0 to 3 the goal corners, 4 to 7 the payload box."""
+"""Number of keypoints, K = 8: 0 to 3 are the goal corners, 4 to 7 belong to the payload's box."""
 
 MAX_SINE = 0.99
-"""Sine of the largest half-angle of the ball: keeps the box finite when the lens touches the ball
-or sinks into it.
+"""Largest sine of the ball's half-angle. It keeps the box finite if the lens touches or enters the
+ball.
 """
 
 
 DIRECTION_EPSILON = 1e-10
-"""Added to the squared sine of the ball's angle: the box's derivative behind the lens then stays
-inside float32.
+"""Added to the squared sine of the ball's angle off the axis, so that the box's derivative behind
+the lens stays finite in float32.
 """
 
 
 class KeypointCamera:
-    """A camera with its constants on one device, made once before the first step (and before a CUDA
-    graph is captured).
+    """A camera with its constants on one device, created before a CUDA graph is captured.
 
     Attributes:
         params: The configuration.
         fisheye: The lens.
         rot_cb: Nominal extrinsic rotation, body to camera, shape (3, 3).
         position_b: Nominal lens position [m], shape (3,), body frame.
-        radius: Of the ball [m]; shape (E,) where vehicles carry different ones.
-        square_w: Goal corners from the goal [m], shape (4, 3), world frame.
-        edge_reads: Whether points outside the field of view read as its edge (else as zero).
+        radius: Radius of the ball [m]; shape (E,) if it differs between vehicles.
+        square_w: Goal corners relative to the goal [m], shape (4, 3), world frame.
+        edge_reads: Whether a point outside the field of view is moved to its edge (else to zero).
     """
 
     def __init__(
@@ -60,10 +59,10 @@ class KeypointCamera:
         self.square_w = goal_square(params.goal_side).to(device=device, dtype=dtype)
         self.edge_reads = params.noise.invalid_reads == "edge"
         self._axes = torch.eye(2, 3, device=device, dtype=dtype)
-        self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
+        self.fisheye.normalize(self.position_b[:2])  # caches the lens constants on this device
 
     def convert_to_arrays(self) -> "KeypointCamera":
-        """Return the camera with its constants as NumPy arrays, for functions of arrays."""
+        """Return a copy of the camera with its constants as NumPy arrays."""
         camera = copy.copy(self)
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
@@ -71,7 +70,7 @@ class KeypointCamera:
         return camera
 
     def extrinsics(self, rotation_error: Tensor, position_error: Tensor) -> tuple[Tensor, Tensor]:
-        """Extrinsics with an error per environment:
+        """Return the extrinsics with an error for each environment:
 
         ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
 
@@ -89,11 +88,11 @@ class KeypointCamera:
 
 
 def goal_square(side: float) -> Tensor:
-    """Corners of the goal square from its centre [m], float64, shape (4, 3), world frame.
+    """Return the goal square's corners from its centre [m], float64, shape (4, 3), world frame.
 
-    Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y), so clockwise seen from above and, from a
-    downward camera whose vehicle faces +x, top left, top right, bottom right, bottom left in the
-    image. Sides are parallel to the world's axes."""
+    Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y): clockwise seen from above. In the image of a
+    downward camera whose vehicle faces +x, they are top left, top right, bottom right, bottom left.
+    Sides are parallel to the world's axes."""
     h = side / 2.0
     return torch.tensor(
         [[h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0], [-h, h, 0.0]], dtype=torch.float64
@@ -101,7 +100,7 @@ def goal_square(side: float) -> Tensor:
 
 
 def goal_corners_w(goal_w: Array, square_w: Array) -> Array:
-    """Corners of the ground square around the goal, on z = 0 for any height of the goal.
+    """Return the corners of the square around the goal, at z = 0 for any height of the goal.
 
     Args:
         goal_w: Goal [m], shape (E, 2) or (E, 3), world frame.
@@ -122,23 +121,24 @@ def ball_extremes_c(
     radius: float | Tensor,
     axes: Tensor | None = None,
 ) -> Tensor:
-    """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the
-    image.
+    """Return the rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline
+    in the image.
 
     The outline of a ball of radius r at distance d is the cone of half-angle ``a = asin(r / d)``
-    about its centre's ray c, exactly and in every direction, past 90 deg too. The image coordinate
-    u grows fastest along its gradient on the sphere, so the extremes of u are the rays ``cos(a) c
-    -+ sin(a) grad u / |grad u|``, and likewise for v. With ``rho = theta_d``, ``s = sin(theta)``,
-    ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``: ``grad u = (g + q c_x^2, q c_x c_y, -rho'
-    c_x)``. The gradient is taken at the centre: the ray's place on the outline is right to first
-    order in a, the extreme value itself, being stationary, to second. At a rope's length (0.38 m)
-    the box is off by at most 2.2e-4 in normalised coordinates.
+    about its centre's ray c. This is exact in every direction, beyond 90 deg too. The image
+    coordinate u increases fastest along its gradient on the sphere, so its extremes are at the rays
+    ``cos(a) c -+ sin(a) grad u / |grad u|``; v is treated in the same way. With ``rho = theta_d``,
+    ``s = sin(theta)``, ``g = rho / s``, ``q = (rho' cos(theta) - g) / s^2``: ``grad u = (g + q
+    c_x^2, q c_x c_y, -rho' c_x)``. The gradient is evaluated at the centre, so the ray's position
+    on the outline is accurate to first order in a. The extreme value is stationary and therefore
+    accurate to second order. At a rope's length (0.38 m) the error of the box is at most 2.2e-4 in
+    normalised coordinates.
 
     Args:
         fisheye: The lens.
         ball_c: Centre of the ball [m], shape (E, 3), camera frame.
         radius: Radius of the ball [m], one or shape (E,).
-        axes: eye(2, 3) on the ball's device, to save making it.
+        axes: eye(2, 3) on the ball's device, if it exists already.
 
     Returns:
         Unit rays, shape (E, 4, 3), camera frame: left, top, right, bottom.
@@ -156,7 +156,7 @@ def ball_extremes_c(
     q = (slope * centre[:, 2] - g) / (s * s)
     lateral = centre[:, :2]
     tangent = torch.cat([lateral * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
-    # (E, 2, 3): of u, of v
+    # gradients of u and v, shape (E, 2, 3)
     gradient = lateral.unsqueeze(-1) * tangent.unsqueeze(-2) + g[:, None, None] * axes
     tx, ty, tz = gradient.unbind(-1)
     size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
@@ -166,11 +166,11 @@ def ball_extremes_c(
 
 
 def box_midpoints(extremes: Array) -> Array:
-    """Edge midpoints of the axis-aligned box through four extreme points.
+    """Return the edge midpoints of the axis-aligned box through four extreme points.
 
-    A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a
-    real detector can take the projection's place; unlike its corners they lie on or next to the
-    ball's outline, so that the field of view decides about each of them.
+    They depend only on the four numbers of a box, so that a detector can replace the projection.
+    Unlike the corners they are on or near the ball's outline, so that the visibility of each can be
+    tested by the field of view.
 
     Args:
         extremes: Image points left, top, right, bottom, shape (E, 4, 2).
@@ -195,19 +195,18 @@ def correct_keypoints(
     turn_b: Tensor,
     scale: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Keypoints of a camera that is turned and whose focal length is another one, as the nominal
-    camera would see them.
+    """Correct keypoints for known errors of the cameras' rotations and focal lengths: return the
+    keypoints that the nominal camera would measure.
 
     Args:
-        camera: Nominal.
+        camera: The nominal camera.
         points: Normalised [-], shape (E, K, 2). valid: shape (E, K), bool.
-        turn_b: Rotation vectors by which the cameras are turned on the body [rad], shape (E, 3),
-            body frame.
+        turn_b: Rotation vectors of the cameras' rotation errors [rad], shape (E, 3), body frame.
         scale: Relative errors of their focal lengths [-], shape (E,).
 
     Returns:
-        Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal
-        field of view is invalid and reads zero.
+        Points [-], shape (E, K, 2), and validity, shape (E, K). A point outside the nominal field
+        of view is invalid and zero.
     """
     plane = points / (1.0 + scale[:, None, None])
     rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(plane))
@@ -219,7 +218,7 @@ def correct_keypoints(
 
 
 def payload_keypoints(camera: KeypointCamera, ball_c: Tensor) -> tuple[Tensor, Tensor]:
-    """Payload keypoints alone: what a detector's box around the ball would give.
+    """Return the payload's keypoints, as a detector's box around the ball would give them.
 
     Args:
         camera: The camera.
@@ -227,8 +226,8 @@ def payload_keypoints(camera: KeypointCamera, ball_c: Tensor) -> tuple[Tensor, T
 
     Returns:
         Normalised edge midpoints (left, top, right, bottom) [-], shape (E, 4, 2), and validity,
-        shape (E, 4): the outline's point on that side is inside the field of view and on the
-        sensor. Extremes beyond the field of view are clipped to its edge first.
+        shape (E, 4): whether the outline's point on that side is inside the field of view and on
+        the sensor. Extremes beyond the field of view are first clipped to its edge.
     """
     rays = ball_extremes_c(camera.fisheye, ball_c, camera.radius, camera._axes)
     extremes, valid = camera.fisheye.project_normalized(rays, clip=True)
@@ -243,7 +242,7 @@ def keypoints(
     payload_w: Tensor,
     extrinsics: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Keypoints of goal and payload as the camera sees them, without noise.
+    """Return the keypoints of goal and payload without noise.
 
     Args:
         camera: The camera, on the device of the other arguments.
@@ -251,17 +250,17 @@ def keypoints(
         rot_wb: Attitude, body to world, shape (E, 3, 3).
         goal_w: Goal [m], shape (E, 2) or (E, 3), world frame; the corners lie on z = 0.
         payload_w: Centre of the ball [m], shape (E, 3), world frame.
-        extrinsics: rot_cb and position_b per environment (`KeypointCamera.extrinsics`); the nominal
-            mount if left out.
+        extrinsics: rot_cb and position_b for each environment (`KeypointCamera.extrinsics`); by
+            default the nominal mount.
 
     Returns:
         Keypoints [-], shape (E, 8, 2), normalised image coordinates (x right, y down, 1 at the edge
         of the field of view), goal corners first (order of `goal_square`), then the payload's box
         (left, top, right, bottom); and validity (bool), shape (E, 8). With ``invalid_reads =
-        "edge"`` an invalid corner reads its direction at the edge and an invalid side of the box is
-        that of the outline clipped to the edge. With ``"zero"`` both read zero, and the middle of a
-        side is valid where that side and the two across it, which give its other coordinate, are
-        seen.
+        "edge"`` an invalid corner is moved to the edge along its direction, and an invalid side of
+        the box is the side of the outline clipped to the edge. With ``"zero"`` both are zero, and
+        the midpoint of a side is valid if that side and the two adjacent sides, which give its
+        other coordinate, are visible.
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, camera.square_w)
@@ -280,10 +279,10 @@ def apply_invalid_rule(camera: KeypointCamera, points: Array, valid: Array) -> t
     Args:
         camera: The camera.
         points: Normalised keypoints [-], shape (E, 8, 2): corners, then the box.
-        valid: Whether corner or side is in the field of view, shape (E, 8).
+        valid: Whether the corner or side is in the field of view, shape (E, 8).
 
     Returns:
-        Keypoints and validity as `keypoints` gives them.
+        Keypoints and validity as `keypoints` returns them.
     """
     if camera.edge_reads:
         return points, valid

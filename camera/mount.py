@@ -1,9 +1,8 @@
-"""Mount of the camera on the vehicle: nominal extrinsics, per-environment extrinsic error, world to
-camera.
+"""Extrinsics of the camera on the vehicle, and the transformation from world to camera frame.
 
-Products are written out elementwise: a batched matrix product would round differently with the
-batch size (and in TF32 where the trainer turns that on), and a vehicle must see the same alone and
-in a batch, bit for bit."""
+Products are written elementwise. A batched matrix product would round differently for each batch
+size (and in TF32 if the trainer enables it), but a vehicle's keypoints must be bitwise equal alone
+and in a batch."""
 
 import math
 
@@ -20,7 +19,7 @@ axis) = -z_b.
 
 
 def rotation_from_vector(vector: Tensor) -> Tensor:
-    """Rotation matrix of a rotation vector (Rodrigues), finite and differentiable at zero.
+    """Convert a rotation vector to a matrix (Rodrigues); finite and differentiable at zero.
 
     Args:
         vector: Axis times angle [rad], shape (..., 3).
@@ -49,7 +48,7 @@ def rotation_from_vector(vector: Tensor) -> Tensor:
 
 
 def nominal_rot_cb(mount: MountParams) -> Tensor:
-    """rot_cb of the mount without error, float64, shape (3, 3)."""
+    """Return rot_cb of the mount without error, float64, shape (3, 3)."""
     roll, pitch, yaw = (math.radians(a) for a in mount.rpy_deg)
     axes = torch.diag(torch.tensor([roll, pitch, yaw], dtype=torch.float64))
     about_x, about_y, about_z = rotation_from_vector(axes)
@@ -59,7 +58,7 @@ def nominal_rot_cb(mount: MountParams) -> Tensor:
 
 
 def rotate(rot: Array, vectors: Array) -> Array:
-    """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
+    """Return ``rot @ v`` for each row v of vectors, as the matrix product ``vectors @ rot^T``.
 
     Args:
         rot: Rotations, shape (..., 3, 3).
@@ -82,7 +81,7 @@ def points_c_from_w(
     rot_cb: Array,
     position_b: Array,
 ) -> Array:
-    """Bring world points into the camera frame.
+    """Transform points from the world to the camera frame.
 
     Args:
         points_w: Points [m], shape (E, K, 3), world frame.

@@ -1,5 +1,5 @@
-"""Drawing of keypoints on the image plane, as the paper's figure shows them: goal green, payload
-red, body axes white.
+"""Drawing of keypoints on frames in the colours of the paper's figure: goal green, payload red,
+body axes white.
 """
 
 import math
@@ -16,8 +16,7 @@ GREEN = (80, 200, 60)
 RED = (60, 60, 230)
 WHITE = (255, 255, 255)
 GREY = (150, 150, 150)
-# fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to
-# 1/16 px
+# fractional bits of OpenCV's drawing coordinates, for an accuracy of 1/16 px
 SHIFT = 4
 
 
@@ -29,16 +28,15 @@ def draw_overlay(
 ) -> ndarray:
     """Draw keypoints, field of view and body axes.
 
-    Goal corners are joined to a green square and the payload's edge midpoints to a red box; where
-    one of a group is invalid only its points are drawn. An invalid point is a grey cross where it
-    reads. Raises ValueError: the image's shape or type is not the camera's.
+    Goal corners are joined to a green square. The payload's edge midpoints define a red box. If a
+    keypoint of a group is invalid, only the group's points are drawn. An invalid keypoint is drawn
+    as a grey cross. Raises ValueError: the image's shape or type is not the camera's.
 
     Args:
         camera: The camera that made the keypoints.
         keypoints: Normalised [-], shape (8, 2).
         valid: Validity, shape (8,).
-        image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; black if left
-            out.
+        image: Frame to draw on, BGR, uint8, shape (H, W, 3) of the camera's size; by default black.
 
     Returns:
         A new picture, BGR, uint8, shape (H, W, 3).
@@ -68,8 +66,8 @@ def draw_overlay(
 
 
 def _to_fixed_point(points: ndarray) -> ndarray:
-    """Pixels as OpenCV's fixed-point integers; far outside the image they are cut off before they
-    overflow.
+    """Convert pixels to OpenCV's fixed-point integers; values far outside the image are clipped
+    before they overflow.
     """
     return np.round(np.clip(points, -1e4, 1e4) * 2**SHIFT).astype(np.int32)
 
@@ -94,7 +92,7 @@ def _draw_group(canvas, points, valid, outline, colour, thick) -> None:
 
 
 def _draw_field_of_view(canvas, lens: Fisheye, thick: int) -> None:
-    """Circle of the field of view, and a thin one at 90 deg off the axis where it lies inside."""
+    """Draw the circle of the field of view, and a thin one at 90 deg off the axis if inside it."""
     import cv2
 
     p = lens.params
@@ -109,9 +107,7 @@ def _draw_field_of_view(canvas, lens: Fisheye, thick: int) -> None:
 
 
 def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
-    """Arrows of the body's x (forward) and y (left) as directions in the image, from the principal
-    point.
-    """
+    """Draw the body's x (forward) and y (left) axes as arrows from the principal point."""
     import cv2
 
     p = camera.fisheye.params

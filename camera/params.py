@@ -1,4 +1,4 @@
-"""Configuration of the camera: one frozen dataclass a file of ``configs/camera``.
+"""Configuration of the camera: frozen dataclasses, one for each table of a ``configs/camera`` file.
 
 Imports neither torch nor cv2.
 """
@@ -12,11 +12,11 @@ import numpy as np
 from camera.field_bounds import Bound, BoundedFields, Length, NotNegative, Positive, Share, Vector
 
 SMALLEST_VIEW = math.radians(1.0)
-"""Angle off the axis that any lens must image [rad]."""
+"""Angle off the axis up to which every lens must form an image [rad]."""
 
 
 def monotonic_limit(coefficients: tuple[float, ...]) -> float:
-    """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
+    """Return the angle off the axis at which theta_d stops increasing [rad], ``inf`` if never."""
     slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
     roots = np.roots(slope)
     real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real
@@ -85,12 +85,12 @@ class FisheyeParams(BoundedFields):
 
 @dataclass(frozen=True)
 class MountParams(BoundedFields):
-    """The camera's place on the body and its rotation.
+    """Position and rotation of the camera on the body.
 
     Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the
     vehicle's front: x_c (image right) = -y_b (the vehicle's right), y_c (image down) = -x_b, z_c
-    (optical axis) = -z_b. ``rpy_deg`` turns the camera about the body axes from there, ``rot_bc =
-    Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative pitch lets it look forward."""
+    (optical axis) = -z_b. ``rpy_deg`` rotates the camera from there about the body axes, ``rot_bc =
+    Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative pitch tilts it forward."""
 
     # lens from the centre of mass [m], body frame
     position_b: Vector = (0.0, 0.0, 0.0)
@@ -102,34 +102,33 @@ class MountParams(BoundedFields):
 
 @dataclass(frozen=True)
 class KeypointNoiseParams(BoundedFields):
-    """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field
-    of view).
+    """Errors of the keypoints, in normalised image coordinates (1 at the edge of the field of
+    view).
 
-    ``invalid_reads``, the rule for what is out of view: ``zero``: it reads as the principal point
-    with validity 0 and tells nothing but that it is not seen, as behind a camera. A point that is
-    computed from the ball's box counts as seen where all of the box that it is computed from is.
-    ``edge``: it reads as its exact, noise-free direction at the edge, radius 1, which only poses
-    can tell: for ablations, and the default for policies from before the rule was recorded. A
-    dropped-out point reads zero in both: nothing was measured. A wrong point reads a place anywhere
-    in the image, and as valid."""
+    ``invalid_reads`` sets the value of a keypoint outside the field of view. ``zero``: the
+    principal point with validity 0, as a real detector would report it. A keypoint of the ball's
+    box is valid where every side of the box that it is computed from is visible. ``edge``: its
+    exact, noise-free direction at the edge, radius 1, which only poses reveal. This is meant for
+    ablations, and is the default for policies exported before the rule was recorded. A dropped-out
+    keypoint is zero in both modes. A wrong keypoint is at a random place in the image and valid."""
 
     step_std: NotNegative = 0.01  # Gaussian per step, keypoint and axis [-]
     bias_std: NotNegative = 0.001  # Gaussian per episode, keypoint and axis [-]
-    drop_probability: Share = 0.0  # per step and keypoint that it reads as invalid [-]
+    drop_probability: Share = 0.0  # per step and keypoint, of being reported invalid [-]
     latency: NotNegative = (
-        0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
+        0.0  # age of the keypoints in the observation, fractions interpolated [policy steps]
     )
-    wrong_probability: Share = 0.0  # per step and keypoint that something else is taken for it [-]
-    held_probability: Share = 0.0  # per step that the last image's keypoints come again [-]
+    wrong_probability: Share = 0.0  # per step and keypoint, of a false detection [-]
+    held_probability: Share = 0.0  # per step, of repeating the last image's keypoints [-]
     scale_std: NotNegative = 0.0  # Gaussian per episode: relative error of the focal length [-]
-    # radius of the image beyond which nothing is visible: a narrower lens, read by its own
-    # calibration [-]
+    # radius beyond which nothing is visible, to imitate a narrower lens with its own calibration
+    # [-]
     visible_radius: Annotated[float, Bound(0.0, 1.0, "(]")] = 1.0
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
     def history_length(self) -> int:
-        """Entries that a latency buffer must hold."""
+        """Number of entries of a latency buffer."""
         return int(-(-self.latency // 1)) + 1
 
     def __post_init__(self) -> None:
@@ -143,10 +142,10 @@ class KeypointNoiseParams(BoundedFields):
 
 @dataclass(frozen=True)
 class CameraParams(BoundedFields):
-    """The whole camera as a policy is trained on it; an exported policy carries these values."""
+    """Complete camera that a policy is trained with. An exported policy carries these values."""
 
     fisheye: FisheyeParams
     mount: MountParams
     noise: KeypointNoiseParams
-    goal_side: Length  # side of the ground square around the target whose corners are seen [m]
-    payload_radius: Length  # radius of the ball whose bounding box is seen [m]
+    goal_side: Length  # side of the square on the ground whose corners are keypoints [m]
+    payload_radius: Length  # radius of the ball whose bounding box gives keypoints [m]

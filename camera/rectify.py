@@ -1,6 +1,6 @@
-"""Rectified views of fisheye frames, on kornia.
+"""Rectified (pinhole) views of fisheye frames, by kornia.
 
-Frames are torch images: float in [0, 1], shape (B, C, H, W), as kornia has them.
+Frames are in kornia's format: float in [0, 1], shape (B, C, H, W).
 """
 
 import math
@@ -17,8 +17,8 @@ from camera.mount import rotation_from_vector
 class ViewParams:
     """A pinhole view cut out of a fisheye frame.
 
-    The view looks along the fisheye's axis, turned by ``yaw_deg`` about the image's down axis
-    (positive: to the right), then by ``pitch_deg`` about its own right axis (positive: up)."""
+    Its axis is the fisheye's, rotated by ``yaw_deg`` about the image's down axis (positive: to the
+    right), then by ``pitch_deg`` about the view's right axis (positive: up)."""
 
     width: int  # [px]
     height: int  # [px]
@@ -28,7 +28,7 @@ class ViewParams:
 
 
 def view_rotation(view: ViewParams) -> Tensor:
-    """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
+    """Return the rotation from the view to the fisheye's camera frame, float64, shape (3, 3)."""
     yaw = math.radians(view.yaw_deg)
     pitch = math.radians(view.pitch_deg)
     turns = torch.tensor([[0.0, yaw, 0.0], [pitch, 0.0, 0.0]], dtype=torch.float64)
@@ -37,7 +37,9 @@ def view_rotation(view: ViewParams) -> Tensor:
 
 
 def view_focal(view: ViewParams) -> float:
-    """Focal length of a view [px]. Raises ValueError: the field of view is not one of a pinhole."""
+    """Return the focal length of a view [px].
+
+    Raises ValueError: a field of view that no pinhole has."""
     if not 0.0 < view.fov_deg < 180.0:
         raise ValueError(
             f"view fov_deg is {view.fov_deg}; expected an angle above 0 and below 180 deg, as a"
@@ -47,10 +49,10 @@ def view_focal(view: ViewParams) -> float:
 
 
 def view_map(lens: Fisheye, view: ViewParams) -> tuple[Tensor, Tensor]:
-    """Return the place in the fisheye frame that each pixel of a view comes from.
+    """Map each pixel of a view to the fisheye frame.
 
-    Returns pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on
-    the sensor, shape (H, W)."""
+    Returns pixels of the fisheye frame [px], float64, shape (H, W, 2), and whether they are in the
+    field of view and on the sensor, shape (H, W)."""
     focal = view_focal(view)
     u = torch.arange(view.width, dtype=torch.float64) - (view.width - 1) / 2.0
     v = torch.arange(view.height, dtype=torch.float64) - (view.height - 1) / 2.0
@@ -70,7 +72,7 @@ def rectify(frames: Tensor, lens: Fisheye, view: ViewParams) -> Tensor:
         frames: Shape (B, C, H, W) of the lens's size.
 
     Returns:
-        Shape (B, C, view.height, view.width), black where the fisheye sees nothing.
+        Shape (B, C, view.height, view.width), black outside the fisheye's field of view.
     """
     from kornia.geometry.transform import remap
 

@@ -1,6 +1,4 @@
-"""HybridSim: a batch of quadrotors, each with a rope and a payload or with neither, stepped one
-control period at a time.
-"""
+"""Batched simulator of quadrotors, with or without rope and payload."""
 
 import dataclasses
 from collections.abc import Callable
@@ -40,20 +38,20 @@ from sim.params import (
 )
 
 PIECES = 8
-"""Number of pieces of a batch for each core of a CPU: a core that has other work for a while leaves
-its pieces to the rest.
+"""Number of pieces of a batch for each CPU core. With several pieces, the other cores can take over
+those of a core that is busy.
 """
 
 FEWEST = 32
-"""Environments of a piece of a step, at least: they take half a millisecond, the launch a tenth."""
+"""Smallest number of environments in a piece: their step takes 0.5 ms, its launch 0.05 ms."""
 LOOK = 0.01
-"""What a kernel that looks at each state once does for an environment, in steps."""
+"""Work of a kernel that only reads each state once, relative to a step."""
 
 INTEGRATORS = ("euler", "rk4")
 """Integrators of a quadrotor without a rope.
 
-Full-range commands keep the mixer at its limits: after a second of them RK4 is 0.6 mm off at 2 ms,
-0.04 mm at 0.5 ms."""
+After 1 s of full-range commands, which saturate the mixer, the error of RK4 is 0.6 mm with steps of
+2 ms and 0.04 mm with 0.5 ms."""
 
 _BUILDS: dict[tuple[Any, ...], tuple[Any, Any, Any]] = {}
 
@@ -65,7 +63,7 @@ def _kernels(
     extensions: frozenset[str],
     without_rope: str | None,
 ) -> tuple[Any, Any, Any]:
-    """Kernels of one choice of blocks; built once a process."""
+    """Return types and kernels for a selection of blocks. They are built once in a process."""
     blocks = (kinds_of(params.vehicle), direct, motors, extensions, without_rope)
     key = (params.sim.precision, params.rope.segments, blocks, structure(params.laws))
     if key not in _BUILDS:
@@ -77,8 +75,8 @@ def _kernels(
 
 
 def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """Return the rope in ``tether_variants`` lengths that span +-``tether_spread``; its mass per
-    metre is kept.
+    """Return ropes of ``tether_variants`` lengths that span +-``tether_spread``, with constant mass
+    per metre.
 
     Environment e gets entry ``e % tether_variants`` (the paper, Sec. III-C).
     """
@@ -91,17 +89,17 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
 
 
 def _factors(spread: float, count: int) -> list[float]:
-    """Return so many factors that span 1 +- a spread; 1 alone is in the middle."""
+    """Return ``count`` factors that span 1 +- ``spread``; a single factor is 1."""
     return np.linspace(1 - spread, 1 + spread, count).tolist() if count > 1 else [1.0]
 
 
 def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
-    """:func:`tether_lengths` with every combination of ``payload_variants`` masses and as many
-    drags of the payload.
+    """Return the ropes of :func:`tether_lengths` in every combination with ``payload_variants``
+    masses and as many drags of the payload.
 
-    They span +-``payload_spread`` and +-``drag_spread``; a spread of 0 leaves one. The payload
-    keeps its size, so its inertia goes with its mass. Environment e gets entry ``e % len(...)``,
-    whose cable is ``e % tether_variants``."""
+    Masses and drags span +-``payload_spread`` and +-``drag_spread``; a spread of 0 gives a single
+    value. The payload's size is constant, so its inertia is proportional to its mass. Environment e
+    gets entry ``e % len(...)``, whose cable is ``e % tether_variants``."""
     spreads = {"payload_spread": z.payload_spread, "drag_spread": z.drag_spread}
     if z.payload_variants < 1 or not all(0.0 <= spread < 1.0 for spread in spreads.values()):
         raise ValueError(
@@ -127,7 +125,7 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
 def _check(
     params: PlantParams, count: int, ropes: list[RopeParams], without_rope: str | None
 ) -> None:
-    """Refuse a batch that cannot be simulated."""
+    """Raise ValueError if the batch cannot be simulated."""
     if count < 1:
         raise ValueError(f"HybridSim of {count} environments; expected 1 or more")
     if without_rope not in (None, *INTEGRATORS):
@@ -145,19 +143,19 @@ def _check(
 
 
 class HybridSim:
-    """Batched plant: command queue, rate controller, motors, battery, aerodynamics, rope, payload,
-    release.
+    """A batch of plants: command queue, rate controller, motors, battery, aerodynamics, rope,
+    payload, release.
 
-    All arrays live on the device and keep their addresses for life, so a captured graph of ``step``
+    All arrays are on the device and are never reallocated, so that a captured graph of ``step``
     stays valid.
 
     Attributes:
         command: [N, rad/s], shape (E,) of vec4: collective thrust and body rates of the next step.
-        release: shape (E,), int: non-zero asks for the release; the latch keeps it.
+        release: shape (E,), int: a value other than 0 commands the release, which the latch holds.
         state: arrays of :data:`sim.kernels.state.STATE_FIELDS`.
         out: arrays of :data:`sim.kernels.state.OUTPUT_FIELDS`.
         vehicles: parameters of environment e at ``e % len(vehicles)``.
-        goal_w: [m], shape (E,) of vec3: goals that :meth:`randomize` draws.
+        goal_w: goals drawn by :meth:`randomize` [m], shape (E,) of vec3.
     """
 
     def __init__(
@@ -180,21 +178,21 @@ class HybridSim:
     ):
         """Allocate ``count`` plants.
 
-        Raises ValueError: no environment, ropes of different segment counts, a law that no block
-        can be made of, or an unknown integrator.
+        Raises ValueError: no environment, ropes of different segment counts, an invalid law, or an
+        unknown integrator.
 
         Args:
-            params: the plant; its kinds and numerics hold for all.
+            params: the plant. Its kinds of blocks and its numerics apply to all environments.
             count: number of environments E.
             device: Warp device, "cpu" or "cuda:0". seed: of :meth:`randomize`.
-            vehicles: of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
-            ropes, airs, releases: likewise; all ropes with the same number of segments.
-            direct: by-pass the blocks: commands are thrust [N] and torque [N m].
-            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
-            without_rope: simulate quadrotors without rope and payload, by this one of
-                :data:`INTEGRATORS`; :meth:`set_wrench` pushes them.
-            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, besides what parameters need.
-            gravity: of free fall, along -z [m/s^2]. threads: at most, of a CPU; default all cores.
+            vehicles: environment e gets entry ``e % len(vehicles)``; default ``[params.vehicle]``.
+            ropes, airs, releases: likewise; all ropes must have the same number of segments.
+            direct: bypass the blocks: commands are thrust [N] and torque [N m].
+            motors: bypass the rate controller: commands are motor-speed set-points [rad/s].
+            without_rope: simulate quadrotors without rope and payload, with this integrator of
+                :data:`INTEGRATORS`; :meth:`set_wrench` applies external wrenches to them.
+            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, besides the required ones.
+            gravity: along -z [m/s^2]. threads: largest number of a CPU; default all cores.
         """
         if without_rope is not None:
             params = change_values(params, {"rope.segments": 1})
@@ -222,9 +220,7 @@ class HybridSim:
         self.place(pos_w=np.zeros((count, 3)))
 
     def _make_exchange(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
-        """Return the solver of the plant's bodies with what it exchanges; None for the fused
-        kernel.
-        """
+        """Return the exchange with the solver of the plant's bodies; None for the fused kernel."""
         params = self.params
         build = self._solver()
         if build is None:
@@ -245,7 +241,7 @@ class HybridSim:
         return solvers.Exchange(kernels, world, build)
 
     def _solver(self) -> Callable[[solvers.World], solvers.Solver] | None:
-        """Return the builder of the solver of the plant's bodies; None for the fused kernel."""
+        """Return the class of the bodies' solver; None for the fused kernel."""
         name = self.params.sim.solver
         return None if name == "chain" else solvers.solver_class(name)
 
@@ -255,7 +251,7 @@ class HybridSim:
         return self._exchange is None or self._exchange.solver.capturable
 
     def _allocate(self, depth: int) -> None:
-        """Make the arrays of state and output, with a command queue so deep."""
+        """Allocate the arrays of state and output; ``depth``: length of the command queue."""
         t = self.types
         count = self.count
         device = self.device
@@ -274,8 +270,8 @@ class HybridSim:
         self._spreads: tuple[RandomizationParams, wp.array[Any]] | None = None
 
     def step(self, mask: "wp.array[Any] | None" = None) -> None:
-        """Advance every plant by one control period under ``command`` and ``release``; with a
-        ``mask``, shape (E,), where it is not 0.
+        """Advance the plants by one control period under ``command`` and ``release``; with a
+        ``mask``, shape (E,), int, only those where it is not 0.
         """
         self.inputs.mask = self._all if mask is None else mask
         if self._exchange is not None:
@@ -285,16 +281,14 @@ class HybridSim:
         self._launch(self._step.step, arguments, block_dim=64)
 
     def foresee(self) -> None:
-        """Write into ``foreseen`` what follows if every payload separates now; the plants stay as
-        they are.
+        """Predict the outputs if every payload separated now, and write them into ``foreseen``. The
+        plants are not changed.
         """
         inputs = [self._plants, self.state, self.foreseen]
         self._launch(self._step.foresee, inputs, block_dim=64, work=LOOK)
 
     def randomize(self, spreads: RandomizationParams, mask: "wp.array[Any] | None" = None) -> None:
-        """Start new episodes where ``mask`` (shape (E,), int) is non-zero; everywhere
-        without one.
-        """
+        """Start new episodes where ``mask``, shape (E,), int, is not 0; by default everywhere."""
         if self._spreads is None or self._spreads[0] != spreads:
             packed = pack(self.types.Randomization, spreads)
             self._spreads = (
@@ -324,9 +318,9 @@ class HybridSim:
         cable_vel_w: ndarray | None = None,
         battery_used: float = 0.0,
     ) -> None:
-        """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
+        """Set the pose and velocity of every plant, with actuators and command queue at hover.
 
-        Raises ValueError: a shape that does not fit.
+        Raises ValueError: a wrong shape.
 
         Args:
             pos_w: [m], shape (E, 3).
@@ -334,7 +328,7 @@ class HybridSim:
             vel_w: [m/s], shape (E, 3). rate_b: [rad/s], shape (E, 3).
             cable_dir_w: unit vectors, shape (E, L, 3); default hanging.
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3).
-            battery_used: fraction of charge used.
+            battery_used: fraction of the charge that is used.
         """
         zero = np.zeros(3)
         rows = np.zeros((self.params.rope.segments, 3))
@@ -354,8 +348,8 @@ class HybridSim:
         self.adopt()
 
     def adopt(self, mask: "wp.array[Any] | None" = None) -> None:
-        """Take over bodies and ropes as they were written into ``state``, where ``mask`` is not 0:
-        the payload follows from them.
+        """Apply the bodies and ropes that were written into ``state`` where ``mask`` is not 0, and
+        compute the payload from them.
         """
         if self._exchange is None:
             self._launch(self._step.payload, [self._plants, self.state, self.out], work=LOOK)
@@ -366,7 +360,7 @@ class HybridSim:
     def _launch(
         self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0
     ) -> None:
-        """Launch a kernel for all plants, on a CPU in pieces that run side by side."""
+        """Launch a kernel for all plants; on a CPU in pieces that run in parallel."""
         count = self.count
         device = self.device
         if device == "cpu" and self.threads > 1:
@@ -376,7 +370,7 @@ class HybridSim:
         if pieces <= 1:
             wp.launch(kernel, count, [0, *arguments], device=device, block_dim=block_dim)
             return
-        kernel.module.load(device, block_dim=1)  # by one thread, as a launch there would
+        kernel.module.load(device, block_dim=1)  # once, before several threads launch the kernel
 
         def launch(first: int, last: int) -> None:
             wp.launch(kernel, last - first, [first, *arguments], device=device)
@@ -384,8 +378,8 @@ class HybridSim:
         launch_in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
     def plants(self) -> tuple[ndarray, ndarray]:
-        """Parameters of vehicle and rope of every environment as the kernels read them: structured
-        arrays, shape (E,).
+        """Return the parameters of every environment's vehicle and rope in the kernels' format:
+        structured arrays, shape (E,).
         """
         vehicles = self._plants.vehicles.numpy()
         ropes = self._plants.ropes.numpy()
@@ -404,8 +398,8 @@ class HybridSim:
         self.release.assign(asked.astype(np.int32))
 
     def set_wrench(self, force_w: ndarray, torque_b: ndarray) -> None:
-        """Copy a wrench from outside [N], [N m], shapes (E, 3), to the device; it acts until the
-        next one.
+        """Copy external forces [N] and torques [N m], shapes (E, 3), to the device. They act until
+        they are set again.
 
         Raises ValueError: another shape, or a simulator built without the extension "push"."""
         if "push" not in self.extensions:
@@ -415,8 +409,8 @@ class HybridSim:
         st.put(self.types, self.state, wrench, self.count)
 
     def get(self, name: str) -> ndarray:
-        """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L,
-        ...).
+        """Return a copy of a state or output array with the environment first: shape (E, ...) or
+        (E, L, ...).
         """
         if name in st.STATE_FIELDS:
             return st.fetch(getattr(self.state, name))
@@ -427,8 +421,8 @@ class HybridSim:
         )
 
     def cable_points_w(self) -> ndarray:
-        """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3),
-        world frame.
+        """Return the rope's joints from the mount to its lower end [m], shape (E, L + 1, 3), world
+        frame.
         """
         ropes = self._plants.ropes.numpy()
         rows = np.arange(self.count) % len(ropes)

@@ -1,5 +1,5 @@
-"""Calibration of a camera: files of other tools, other lens models, and pictures of a board."""
+"""Calibration of a camera from other tools' files, other lens models, or pictures of a board."""
 
-BOARD = (  # words after ``--board``
+BOARD = (  # syntax of the option ``--board``
     "chessboard|circles|charuco COLUMNS ROWS SIDE [MARKER [DICTIONARY]]"
 )

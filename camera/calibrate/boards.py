@@ -1,5 +1,5 @@
-"""Calibration from pictures of a board, through OpenCV's fisheye calibration, and the check of a
-lens against such pictures.
+"""Calibration from pictures of a board by OpenCV's fisheye calibration, and check of a lens against
+such pictures.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,27 +13,29 @@ from camera.fisheye import Fisheye
 from camera.params import FisheyeParams, monotonic_limit
 
 DETECTED_AT_LEAST = 3
-"""Views with a found board below which the intrinsics are not determined."""
+"""Smallest number of pictures with a detected board that determines the intrinsics."""
 
 BEFORE = 0.17
-"""Cosine of the angle off the axis up to which points start the fit of a pose: 80 deg."""
+"""Cosine of the largest angle off the axis (80 deg) of points that initialise a pose's fit."""
 
 WRONG_BOARD = 5.0
-"""Residual of a board over the median of all, above which its corners are another's."""
+"""Ratio of a board's residual to the median of all boards above which its corners count as wrongly
+detected.
+"""
 
 VIEW_AT_LEAST = 6
-"""Points of a partly visible board below which its pose is not determined well."""
+"""Smallest number of points of a partly visible board that determines its pose well."""
 
 
 @dataclass(frozen=True)
 class BoardParams:
-    """A board: chessboard (inner corners, where four squares meet), circles (a grid of their
-    centres) or ChArUco.
+    """A calibration board: a chessboard with its inner corners as points, a grid of circles with
+    their centres, or ChArUco.
 
-    Raises ValueError: a size that is no board's, or a dictionary that OpenCV does not have.
+    Raises ValueError: an impossible size, or a dictionary that OpenCV does not have.
 
-    Convention: point (i, j) lies at ``(j, i, 0) square_size`` from the first, x along the columns,
-    y along the rows."""
+    Convention: point (i, j) is at ``(j, i, 0) square_size`` from the first, x along the columns, y
+    along the rows."""
 
     columns: int  # points along x: inner corners, or circles
     rows: int  # points along y
@@ -55,12 +57,12 @@ class BoardParams:
             )
 
     def corners_m(self) -> ndarray:
-        """Points row by row [m], float64, shape (rows * columns, 3), board frame."""
+        """Return the points row by row [m], float64, shape (rows * columns, 3), board frame."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_size
 
     def charuco(self) -> Any:
-        """OpenCV's object of a ChArUco board: one square more each way than inner corners."""
+        """Return OpenCV's ChArUco board, which counts squares: one more each way than corners."""
         import cv2
 
         names = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
@@ -75,8 +77,8 @@ class BoardParams:
 
 @dataclass(frozen=True)
 class View:
-    """A board as one picture shows it: points [m], shape (N, 3), board frame, and their pixels
-    [px], shape (N, 2).
+    """Detected points of a board in one picture: points [m], shape (N, 3), board frame, and their
+    pixels [px], shape (N, 2).
     """
 
     points_m: ndarray
@@ -88,10 +90,10 @@ class BoardReport:
     """Residuals of a calibration over its pictures.
 
     Attributes:
-        rms_px: Root mean square distance of corners and their reprojections over all views [px].
-        image_rms_px: The same for each picture [px]; NaN where no board was found.
-        points: Points of boards in all pictures.
-        left_out: Why a board was not used, by the number of its picture from 0.
+        rms_px: RMS distance between corners and their reprojections over all pictures [px].
+        image_rms_px: RMS distance in each picture [px]; NaN if no board was found.
+        points: Number of board points in all pictures.
+        left_out: Index of a picture from 0 -> why its board was not used.
     """
 
     rms_px: float
@@ -108,8 +110,8 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         board: The board.
 
     Returns:
-        Its points, row by row; of a ChArUco board the detected ones. None where no whole board (of
-        a ChArUco board: fewer than six points) is found.
+        Its points row by row; of a ChArUco board only the detected ones. None if no complete board
+        (of a ChArUco board: fewer than six points) is found.
     """
     import cv2
 
@@ -118,7 +120,7 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
         if ids is None or len(ids) < VIEW_AT_LEAST:
             return None
-        # free of the marker about each corner, in squares
+        # half side of the window around a corner without markers, in squares
         margin = 0.5 * (1.0 - board.marker_size / board.square_size)
         points = board.corners_m()[ids.ravel()]
         return View(points, _refine(grey, corners.reshape(-1, 2), margin))
@@ -128,7 +130,7 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         if success:
             return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64))
         return None
-    # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes
+    # Equalising the histogram helps in bad light but costs accuracy in good light, so it is tried
     # second.
     size = (board.columns, board.rows)
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
@@ -139,12 +141,12 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
 
 
 def _refine(grey: ndarray, corners: ndarray, share: float = 0.45) -> ndarray:
-    """Corners at sub-pixel accuracy, from windows that reach a share of the way to the nearest
-    other corner.
+    """Refine corners to sub-pixel accuracy, in windows whose half side is a share of the distance
+    to the nearest other corner.
 
-    The detector's own sub-pixel step assumes straight edges over a whole square, which a fisheye
-    bends: on rendered boards the lens calibrated from it was 0.76 px off, with this step 0.10 px.
-    """
+    The detector's sub-pixel step assumes straight edges along a whole square, which a fisheye
+    bends. On rendered boards the lens calibrated from it had an error of 0.76 px; with this step
+    the error is 0.10 px."""
     import cv2
 
     distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
@@ -161,9 +163,9 @@ def calibrate_from_boards(
 ) -> tuple[FisheyeParams, BoardReport]:
     """Calibrate a fisheye from pictures of a board.
 
-    OpenCV's model folds past 90 deg off the axis: a board that reaches past it is left out, as one
-    is that fits far worse than the others; the report says which and why. The polynomial goes on
-    past 90 deg. Raises ValueError: pictures differ in size, or too few show a board that fits.
+    OpenCV's model ends 90 deg off the axis. Boards that reach beyond and boards that fit much worse
+    than the others are left out; the report states the reasons. The resulting polynomial is used
+    beyond 90 deg. Raises ValueError: pictures differ in size, or too few show a board that fits.
 
     Args:
         images: Pictures of one camera, uint8, shape (H, W) or (H, W, 3); at least three with the
@@ -172,7 +174,7 @@ def calibrate_from_boards(
         fov_deg: Full field of view of the result [deg].
 
     Returns:
-        The fisheye and the residuals, for all views and for each.
+        The fisheye, and the residuals of all views together and of each.
     """
     (height, width), boards = find_boards(images, board)
     views = {i: view for i, view in enumerate(boards) if view is not None}
@@ -189,7 +191,7 @@ def calibrate_from_boards(
             break
         except _MisfitError as misfit:
             left_out[used[misfit.board]] = str(misfit)
-    # A wrong board spoils the first fits, and a good one may have been left out in its place: each
+    # A wrong board disturbs the first fits, so that a good one may have been left out instead: each
     # is tried again.
     for number in list(left_out):
         more = sorted([*used, number])
@@ -205,7 +207,7 @@ def calibrate_from_boards(
 
 
 class _MisfitError(Exception):
-    """Says why no lens fits all boards; ``board`` is the one to leave out."""
+    """No lens fits all boards; ``board`` is the index of the board to leave out."""
 
     def __init__(self, board: int, reason: str):
         super().__init__(reason)
@@ -215,7 +217,7 @@ class _MisfitError(Exception):
 def _fit(
     views: list[View], width: int, height: int, fov_deg: float
 ) -> tuple[FisheyeParams, list[ndarray]]:
-    """Fit a lens to boards; returns it, and the residuals of each board [px], shape (2 N,).
+    """Fit a lens to boards. Returns the lens and the residuals of each board [px], shape (2 N,).
 
     Raises _MisfitError: OpenCV's model cannot be fitted, or a board fits far worse than the others.
     """
@@ -242,18 +244,19 @@ def _fit(
 
 
 def _farthest(views: list[View], width: int, height: int) -> tuple[int, float]:
-    """Return the board that reaches farthest from the image's centre, and how far [px]."""
+    """Return the index of the board with the point farthest from the image's centre, and its
+    distance [px].
+    """
     centre = np.array([width - 1.0, height - 1.0]) / 2.0
     reach = [float(np.linalg.norm(view.pixels - centre, axis=1).max()) for view in views]
     return int(np.argmax(reach)), max(reach)
 
 
 def _solve(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:
-    """OpenCV's fisheye of boards; its field of view ends where it folds."""
+    """Calibrate a fisheye by OpenCV; its field of view is limited to where theta_d increases."""
     import cv2
 
-    # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step
-    # inside the model.
+    # With the focal length at which 180 deg fill the width, OpenCV's first step stays valid.
     start = np.diag([width / np.pi, width / np.pi, 1.0])
     start[:2, 2] = (width / 2 - 0.5, height / 2 - 0.5)
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
@@ -271,8 +274,8 @@ def _solve(views: list[View], width: int, height: int, fov_deg: float) -> Fishey
 
 
 def check_boards(images: list[ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
-    """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the
-    lens is left as it is.
+    """Return the reprojection error of a given lens on pictures of a board. Only the boards' poses
+    are fitted.
 
     Raises ValueError: pictures are not of the lens's size, or too few show the board.
 
@@ -294,7 +297,7 @@ def check_boards(images: list[ndarray], board: BoardParams, fisheye: FisheyePara
 def find_boards(
     images: list[ndarray], board: BoardParams
 ) -> tuple[tuple[int, int], list[View | None]]:
-    """Size (height, width) of all pictures, and what each shows of the board.
+    """Return the size (height, width) of all pictures, and the detected board in each.
 
     Raises ValueError: pictures differ in size, or fewer than three show the board.
     """
@@ -314,8 +317,8 @@ def find_boards(
 
 
 def board_pose(lens: Fisheye, view: View) -> ndarray:
-    """Pose of a board by least squares of its pixels: rotation vector [rad] and place of its first
-    point [m], shape (6,), camera frame.
+    """Fit the pose of a board by least squares of its pixels: rotation vector [rad] and position of
+    its first point [m], shape (6,), camera frame.
     """
     import cv2
     from scipy.optimize import least_squares
@@ -342,16 +345,14 @@ def board_pose(lens: Fisheye, view: View) -> ndarray:
 
 
 def reproject(lens: Fisheye, view: View) -> ndarray:
-    """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was
-    fitted.
-    """
+    """Fit a board's pose and return the pixels of its reprojected points [px], shape (N, 2)."""
     residual = _residual(lens, view, board_pose(lens, view))
     return np.asarray(view.pixels + residual.reshape(-1, 2))
 
 
 def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:
-    """Reprojected less detected pixels [px], shape (2 N,), of a board at a pose (rotation vector,
-    place).
+    """Return reprojected minus detected pixels [px], shape (2 N,), of a board at a pose (rotation
+    vector, position).
     """
     import cv2
 
@@ -362,7 +363,7 @@ def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:
 
 
 def _report(residuals: list[ndarray | None]) -> BoardReport:
-    """Errors of pictures from their residuals, shape (2 N,) each."""
+    """Compute the report from the pictures' residuals, shape (2 N,) each; None without a board."""
 
     def rms(residual: ndarray) -> float:
         return float(np.sqrt(2.0 * np.mean(residual * residual)))

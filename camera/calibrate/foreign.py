@@ -1,7 +1,7 @@
-"""Lens models of other tools, and their conversion into ours by a fit.
+"""Lens models of other tools, and their conversion into our model by a fit.
 
-A model is a core (how a ray meets the image plane) and a distortion of that plane, such as
-``omni-radtan``. NumPy, float64: this runs once, when a calibration file is read.
+A model such as ``omni-radtan`` is a core (projection of a ray to the image plane) and a distortion
+of that plane. NumPy, float64: the conversion runs once, when a calibration file is read.
 """
 
 import math
@@ -19,26 +19,28 @@ Array = NDArray[np.float64]
 Values = Mapping[str, float]
 
 HOLDS_PX = 0.05
-"""Difference of pixels up to which a fitted lens counts as the lens of the file [px]."""
+"""Difference of pixels up to which a fitted lens counts as equal to the lens of the file [px]."""
 ANGLES = 721
-"""Angles off the axis, from 0 to 180 deg, on which a lens is sampled."""
+"""Number of angles off the axis, from 0 to 180 deg, at which a lens is sampled."""
 TURNS = 48
-"""Directions about the axis on which a lens is sampled."""
+"""Number of directions about the axis at which a lens is sampled."""
 LARGEST_DECENTRING = 0.01
-"""Tangential coefficients p1, p2 that no lens reaches; calibrations of others stay below 0.003."""
+"""Tangential coefficient p1 or p2 that no real lens reaches; published calibrations are below
+0.003.
+"""
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """The error of our model fitted to another, as a difference of pixels for the same ray."""
+    """Error of our model when fitted to another: difference of pixels for the same ray."""
 
     model: str  # of the file
-    rms_px: float = 0.0  # over all that the image sees [px]
-    max_px: float = 0.0  # there [px]
+    rms_px: float = 0.0  # over all rays in the image [px]
+    max_px: float = 0.0  # over all rays in the image [px]
     points: int = 0  # rays compared; 0: the file holds our model, nothing was fitted
-    # full angle out to which the difference stays below `HOLDS_PX` [deg]
+    # full angle up to which the difference stays below `HOLDS_PX` [deg]
     holds_deg: float = 360.0
-    remarks: tuple[str, ...] = ()  # what the file's numbers say against themselves
+    remarks: tuple[str, ...] = ()  # warnings about the file's numbers
 
 
 def _omni(values: Values, side2: Array, z: Array) -> Array:
@@ -75,8 +77,8 @@ DENOMINATORS: dict[str, tuple[str, Callable[[Values, Array, Array], Array]]] = {
     "eucm": ("alpha beta", _eucm),
     "ds": ("xi alpha", _ds),
 }
-"""Core -> its parameters, and what x and y of a ray are divided by on the image plane, of
-``x^2 + y^2`` and ``z``; a ray is imaged where that is above 0.
+"""Core -> its parameters, and a function of ``x^2 + y^2`` and ``z`` that returns the divisor of a
+ray's x and y on the image plane. A ray is imaged if the divisor is above 0.
 """
 
 
@@ -106,16 +108,17 @@ DISTORTIONS: dict[str, tuple[str, Callable[[Values, Array], Array]]] = {
     "radtan": ("k1 k2 p1 p2 k3 k4 k5 k6", _radtan),
     "fov": ("w", _fov),
 }
-"""Distortion -> its parameters in the usual order, and what it makes of the image plane."""
+"""Distortion -> its parameters in the usual order, and the function that distorts the image plane.
+"""
 
 ANGULAR = ("kb4", "polyfisheye", "ocam")
-"""Models whose radius follows from the angle off the axis; the first is ours."""
+"""Models that give the radius as a function of the angle off the axis; the first is ours."""
 
 
 def project(model: str, values: Values, rays: Array) -> Array:
-    """Project unit rays, shape (N, 3), by a foreign model.
+    """Project unit rays, shape (N, 3), by another tool's model.
 
-    Returns pixels [px], shape (N, 2); NaN where the model images nothing.
+    Returns pixels [px], shape (N, 2); NaN for a ray that the model does not image.
     """
     core, _, distortion = model.partition("-")
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -135,7 +138,7 @@ def project(model: str, values: Values, rays: Array) -> Array:
 
 
 def _kb4_radius(values: Values, theta: Array) -> Array:
-    """Kannala and Brandt's, as :class:`camera.params.FisheyeParams` says."""
+    """Kannala and Brandt's model, see :class:`camera.params.FisheyeParams`."""
     powers = np.array([1.0, *[values[f"k{i}"] for i in range(1, 5)]])
     return np.asarray(theta * polyval(theta * theta, powers))
 
@@ -170,12 +173,12 @@ _RADII = {"kb4": _kb4_radius, "polyfisheye": _polyfisheye_radius, "ocam": _ocam_
 
 @dataclass(frozen=True)
 class _Samples:
-    """Rays that a lens images one to one, from the axis outwards."""
+    """Sampled rays from the axis outwards, as far as the lens images them one-to-one."""
 
     theta: Array  # [rad], shape (N,)
     direction: Array  # unit vectors across the axis, shape (N, 2)
     pixels: Array  # shape (N, 2)
-    fold: float  # angle at which the image turns back before it leaves the sensor; pi if nowhere
+    fold: float  # angle at which the radius stops increasing inside the image; pi if nowhere
 
 
 def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
@@ -192,7 +195,7 @@ def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
         on_image = np.all((pixels >= -0.5) & (pixels <= [width - 0.5, height - 0.5]), axis=2)
     one_to_one = np.logical_and.accumulate(grows, axis=0)
     visible = np.logical_and.accumulate(one_to_one & on_image, axis=0)
-    last = np.sum(visible, axis=0)  # the first angle of each direction that is not seen
+    last = np.sum(visible, axis=0)  # index of the first angle in each direction that is not visible
     last_angle = np.minimum(last, ANGLES - 1)
     folds = ~one_to_one[last_angle, np.arange(TURNS)] & (last < ANGLES)
     fold = float(theta[last_angle[folds]].min()) if np.any(folds) else math.pi
@@ -203,22 +206,22 @@ def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
 def fit_fisheye(
     model: str, values: Values, width: int, height: int, fov_deg: float | None = None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Fit our model to a foreign one, by least squares of the pixel difference over all rays that
-    the image sees.
+    """Fit our model to another tool's, by least squares of the pixel difference over all rays in
+    the image.
 
-    fx, fy and k1 to k4 are fitted, and the principal point where the foreign lens is not symmetric
-    about its own. Raises ValueError: the image shows too little, or the fit describes no camera.
+    fx, fy and k1 to k4 are fitted, and the principal point too if the other lens is not symmetric
+    about its own. Raises ValueError: the image contains too few rays, or the fit is no valid lens.
 
     Args:
         model: A core of `DENOMINATORS`, a hyphen and one of `DISTORTIONS`; or one of `ANGULAR`.
         values: fx, fy, cx, cy [px], the model's parameters; ``skew``, ``shear`` of its pixels.
         width: Image width [px].
         height: Image height [px].
-        fov_deg: Full field of view to fit in [deg]; by default all that the image sees.
+        fov_deg: Full field of view of the fit [deg]; by default the whole image.
 
     Returns:
-        The fisheye and what the fit left over. Its field of view is the asked one, cut to what the
-        image sees and to where either model folds back: nothing is extrapolated.
+        The fisheye and the error of the fit. The field of view is limited to the requested one, to
+        the image and to the angle at which either model folds back: nothing is extrapolated.
     """
     samples = _sample(model, values, width, height)
     limit = samples.fold if fov_deg is None else min(math.radians(fov_deg) / 2.0, samples.fold)
@@ -255,7 +258,7 @@ def fit_fisheye(
 
 
 def _project_ours(unknown: Array, theta: Array, direction: Array) -> Array:
-    """Pixels of our model, of fx, fy, cx, cy, k1 to k4."""
+    """Project by our model; ``unknown``: fx, fy, cx, cy, k1 to k4. Returns pixels [px]."""
     powers = theta[:, None] ** (2 * np.arange(1, 5) + 1)
     radius = theta + powers @ unknown[4:]
     return direction * radius[:, None] * unknown[:2] + unknown[2:4]
@@ -264,7 +267,7 @@ def _project_ours(unknown: Array, theta: Array, direction: Array) -> Array:
 def _fit_radial(
     theta: Array, direction: Array, pixels: Array, centre: Array, values: Values
 ) -> Array:
-    """fx, fy, cx, cy, k1 to k4; every angle off the axis counts alike."""
+    """Fit fx, fy, cx, cy, k1 to k4; all angles off the axis have equal weight."""
     from scipy.optimize import least_squares
 
     crooked = any(values.get(name, 0.0) for name in ("p1", "p2", "skew", "shear"))
@@ -286,8 +289,8 @@ def _fit_radial(
 
 
 def image_fov_deg(fisheye: FisheyeParams) -> float:
-    """Full field of view that the farthest corner of the image sees [deg], cut to where theta_d
-    stops growing and to 360.
+    """Return the full field of view up to the farthest corner of the image [deg], at most 360 and
+    at most to the angle at which theta_d stops increasing.
     """
     limit = min(monotonic_limit(fisheye.coefficients), math.pi) * (1.0 - 1e-9)
     right = fisheye.width - 0.5
