@@ -1,10 +1,9 @@
-"""Proposal of a mapping: what the columns of a foreign table are, by their names, their values and
-physics.
+"""Proposal of a mapping of a foreign table's columns, by their names, their values and physics.
 
-Names say which columns belong together and hint at what they are; values say the units (a
-quaternion has length 1, a resting accelerometer 9.81 m/s^2 or 1 g); physics decides: a velocity is
-the derivative of a position, rates are those of the attitude, a payload keeps its distance. What
-none of them tells becomes a question."""
+Names group columns and hint at their quantities. Values determine units: a quaternion has length 1,
+a resting accelerometer shows 9.81 m/s^2 or 1 g. Physics decides: a velocity is the derivative of a
+position, rates are those of the attitude, a payload keeps its distance. Whatever remains uncertain
+becomes a question."""
 
 import re
 from collections import defaultdict
@@ -24,22 +23,22 @@ from visthrow.logs.mapping import TableMap, TimeColumn
 from visthrow.logs.readers.table_to_log import Table, logs_of
 from visthrow.logs.unit_names import UNITS, fitting_units
 
-# of rotors, by mass; without any, wind would be named as a tilt (Faessler et al. 2018) [1/s]
+# rotor drag over mass [1/s] (Faessler et al. 2018); without drag, wind would be found as a tilt
 _DRAG = 0.3
 _TIMES = ("s", "ms", "us", "ns")
-_STEP = (2e-4, 0.25)  # between two rows of a log [s]
+_STEP = (2e-4, 0.25)  # range of the time between two rows of a log [s]
 
 
 @dataclass
 class MappingProposal:
-    """A mapping, why, and what is left to ask."""
+    """A proposed mapping, with reasons and open questions."""
 
     mapping: TableMap | None = None
-    # parameters of the flying model as far as the log tells them, None where it cannot fly one
+    # proposed parameters of the flying model; None if the log holds too little for one
     flyer: dict | None = None
-    why: dict[str, str] = field(default_factory=dict)  # by channel
+    why: dict[str, str] = field(default_factory=dict)  # channel -> reason
     questions: list[str] = field(default_factory=list)
-    left_out: list[str] = field(default_factory=list)  # columns that no channel takes, and parts
+    left_out: list[str] = field(default_factory=list)  # unused columns and parts of the source
 
 
 def propose(
@@ -47,9 +46,8 @@ def propose(
 ) -> MappingProposal:
     """Propose a mapping of the columns of a table, or of the tables of a recording.
 
-    ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed;
-    ``time_unit``: of the stamps, where it is known. Raises LogError: no column holds numbers that
-    change.
+    ``source``: name for messages; ``mass``: of the vehicle alone [kg], if it was weighed;
+    ``time_unit``: of the stamps, if known. Raises LogError: no column holds numbers that change.
     """
     numbers = {
         name: np.where(np.isfinite(cells.astype(float)), cells, np.nan)
@@ -84,10 +82,10 @@ def propose(
 
 
 def propose_model(log: FlightLog, mass: float | None = None) -> MappingProposal:
-    """Propose a flying model for a log that needs no mapping, in place of which none stands.
+    """Propose a flying model, without a mapping, for a log that needs none.
 
-    ``mass``: of the vehicle alone [kg], where it was weighed.
-    Raises LogError: the log holds too little for one.
+    ``mass``: of the vehicle alone [kg], if it was weighed.
+    Raises LogError: the log holds too little for a flying model.
     """
     proposal = MappingProposal()
     full = _without_sparse(log)
@@ -104,10 +102,12 @@ def propose_model(log: FlightLog, mass: float | None = None) -> MappingProposal:
 def _map_columns(
     numbers: Table, proposal: MappingProposal, settings: dict[str, str], time_unit: str | None
 ) -> TableMap | None:
-    """Map the columns of numbers, and say why and ask in a proposal; None without a channel."""
+    """Map columns of numbers, and add reasons and questions to the proposal; None without a
+    channel.
+    """
     channels = {}
     clocks = {}
-    unread = []  # questions about tables of which nothing is read
+    unread = []  # questions about tables without a channel
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
@@ -131,7 +131,7 @@ def _map_columns(
             channels[entry.name] = replace(entry, clock="" if first else topic)
             proposal.why[entry.name] = recognised.why
         proposal.questions += recognition.questions
-        if topic not in clocks:  # nothing of this table is read
+        if topic not in clocks:  # this table has no channel
             unread += proposal.questions[asked:]
             del proposal.questions[asked:]
         proposal.questions += rivals
@@ -144,7 +144,7 @@ def _map_columns(
 
 
 def _tables(numbers: Table) -> dict[str, Table]:
-    """Columns by the table that they are of: what stands before a colon."""
+    """Group columns by their table, whose name precedes a colon."""
     tables = defaultdict(dict)
     for name, cells in numbers.items():
         tables[name.rpartition(":")[0]][name] = cells
@@ -154,10 +154,10 @@ def _tables(numbers: Table) -> dict[str, Table]:
 def _clock(
     numbers: Table, proposal: MappingProposal, stated_unit: str | None
 ) -> tuple[TimeColumn, ndarray]:
-    """The column of stamps and its unit, or evenly spaced rows."""
+    """Return the mapping of the stamps and their times [s]; without a clock, evenly spaced rows."""
     rising = [name for name, cells in numbers.items() if rises(cells)]
     named = [name for name in rising if PATTERNS["time"].search(name)]
-    named.sort(key=lambda name: "frame" in name.lower())  # frames only where nothing is a time
+    named.sort(key=lambda name: "frame" in name.lower())  # frame counters only without a time
     name = next(iter(named or rising), None)
     if name is None:
         count = max(map(len, numbers.values()))
@@ -167,7 +167,7 @@ def _clock(
         )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     steps = np.diff(numbers[name])
-    step = float(np.median(steps[steps > 0.0]))  # several rows may bear one stamp
+    step = float(np.median(steps[steps > 0.0]))  # several rows may have the same stamp
     rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
     suffix = f"1/{rate[1]} s" if rate else ""
     if suffix not in UNITS:
@@ -189,8 +189,10 @@ def _clock(
 
 
 def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
-    """Read the table by the proposal, hold it against physics, and turn rates whose axes another
-    set explains; the rest is asked about. Returns the log of channels that hold enough.
+    """Read the table by the proposal and check it against physics.
+
+    Axes of rates are corrected if others explain them; other contradictions become questions.
+    Returns the log without sparse channels.
     """
     for attempt in range(2):
         log = _without_sparse(logs_of(table, proposal.mapping, source)[0])
@@ -210,19 +212,19 @@ def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
 
 
 def _without_sparse(log: FlightLog) -> FlightLog:
-    """Return a log without the channels that hold too little."""
+    """Return a log without channels of fewer than 50 valid samples."""
     full = {name: c for name, c in log.channels.items() if c.valid.sum() >= 50}
     return FlightLog(full, log.meta)
 
 
 def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> None:
-    """Hold the thrust's unit against the mass, and ask what that leaves open.
+    """Check the thrust's unit against the mass, and ask what remains open.
 
-    Raises LogError: in grams the mass fits, in kilograms it does not.
+    Raises LogError: the weighed mass fits the thrust in grams, but not in kilograms.
     """
     entry = proposal.mapping.entry("thrust_command")
     carried = _carried_mass(log)
-    heavy = weighed is not None and weighed >= 1e3 * LIGHTEST  # a number of grams, perhaps
+    heavy = weighed is not None and weighed >= 1e3 * LIGHTEST  # perhaps grams
     if entry is None or carried is None:
         if heavy:
             proposal.questions.append(
@@ -233,7 +235,7 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     thrust = f"thrust '{entry.columns[0]}'"
     named = unit_by_name(entry.columns[0]) == entry.unit
     units = (entry.unit,) if named else THRUSTS
-    one = carried / UNITS[entry.unit][1]  # if a number of its column were a newton
+    one = carried / UNITS[entry.unit][1]  # if the column were in newtons
     masses = {unit: one * UNITS[unit][1] for unit in units}
     if weighed is None:
         if not named:
@@ -273,9 +275,10 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
 
 
 def _doubt_of_mass(off: float, hangs: bool) -> str:
-    """Ask what makes a thrust carry another mass than the vehicle's, by the logarithm of their
-    ratio; "" for what a battery's charge makes.
-    """
+    """Return a question about a thrust that carries another mass than the vehicle's; "" for a
+    difference that the battery's charge explains.
+
+    ``off``: log ratio of carried mass to the vehicle's; ``hangs``: whether a payload is mapped."""
     if off < -thrust_checks.MASS_WARN:
         return "of another battery, or a share of the full thrust?"
     if off > thrust_checks.MASS_WARN and not hangs:
@@ -302,7 +305,7 @@ def _usual(total: ndarray) -> float:
 
 
 def _find_input(log: FlightLog, proposal: MappingProposal) -> str:
-    """The input that the force follows best, "" where that cannot be determined."""
+    """Return the input that the force follows best, or "" if that cannot be determined."""
     inputs = [name for name in thrust_checks.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust_checks.follows(log, name)) is not None}
     if len(inputs) < 2:
@@ -320,8 +323,8 @@ def _find_input(log: FlightLog, proposal: MappingProposal) -> str:
 
 
 def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> dict | None:
-    """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
-    small quadrotor at rest air.
+    """Return parameters of a flying model: the thrust is scaled to carry the vehicle, others are
+    those of a small quadrotor.
     """
     applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_find_input(log, proposal)))
     if applied is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
@@ -338,7 +341,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         length = float(np.median(np.linalg.norm(gap, axis=1)))
     motors = 1 if name in ("thrust_command", "throttle") else 4
     hover = _usual(total) / motors
-    share = 0.85 if length else 1.0  # of the vehicle in what flies, until both are weighed
+    share = 0.85 if length else 1.0  # mass of the vehicle over the total, until both are weighed
     whole = weighed / share if weighed else mass or 1.0
     hanging = (1.0 - share) * whole
     if weighed is None:
@@ -351,7 +354,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         proposal.questions.append(f"what does the payload weigh? {hanging:.3g} kg is a guess")
     newtons = mass is not None and name in ("command", "thrust_command")
     first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
-    measured = name == "motor_speed"  # what the rotors do, behind their lag
+    measured = name == "motor_speed"  # measured behind the motors' lag
     power = [0.0, 0.0, first] if measured else [0.0, first, 0.0]
     if name in thrust_checks.PULSES and thrust_checks.are_pulses(log[name].values):
         power[0] = -first * thrust_checks.IDLE_PULSE

@@ -1,4 +1,4 @@
-"""Recognition of channels among groups of columns of one table, by names, values and physics."""
+"""Recognition of channels among a table's groups of columns, by names, values and physics."""
 
 from dataclasses import dataclass, replace
 from itertools import product
@@ -30,34 +30,36 @@ from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 Y_UP = "x,-z,y"
-"""Our axes in those of Motive's world, whose y is up."""
+"""This project's axes in those of Motive's world, whose y is up."""
 NED = "x,-y,-z"
-"""Our axes in those of an autopilot: north, east, down; and forward, right, down of its body."""
+"""This project's axes in those of an autopilot: north, east, down; its body's are forward, right,
+down.
+"""
 _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
-"""Unit of commands of motors by what they exceed."""
-# of motors' pulses: commands from 0 up, such as DShot's, begin below them [us]
+"""Unit of motor commands by the value that their largest exceeds."""
+# range of motors' pulses [us]; commands that start from 0, such as DShot's, go below it
 _LEAST_PULSE = 800.0
 _LARGEST_PULSE = 2300.0
-# Of a path's derivative with what may be it: correlations that settle it, and that suggest it,
+# correlation of a path's derivative with a channel that proves, and that suggests, a relation
 _FIRMLY = 0.8
 _BELONGS = 0.6
-_REACH = 0.2  # delays that are tried [s]
-_SPAN = 0.1  # over which a path is differentiated [s]
+_REACH = 0.2  # largest delay to try [s]
+_SPAN = 0.1  # span over which a path is differentiated [s]
 _COARSE = 0.02  # step of the grid on which many pairs are compared [s]
-_COMPARED = 1000  # rows on which the distance of two paths is judged
-_LARGEST_THRUST = 5000.0  # in any unit: what is larger counts to 65535, as a Crazyflie's
-_TURN = 7.0  # above a full turn in radians: degrees
-_UNUSUAL = 1.0  # nats against an order or axes that are not the usual ones
-_TILTED = 10.0  # nats against an attitude that leans over, or whose mean force does
-_PACK = (2.5, 60.0)  # of any vehicle's battery [V]
+_COMPARED = 1000  # rows at which the distance of two paths is compared
+_LARGEST_THRUST = 5000.0  # in any unit; larger values are counts to 65535, as a Crazyflie's
+_TURN = 7.0  # angles beyond a full turn in radians are in degrees
+_UNUSUAL = 1.0  # nats against an unusual order or unusual axes
+_TILTED = 10.0  # nats against an attitude that is tilted, or that tilts the mean force
+_PACK = (2.5, 60.0)  # voltage of any vehicle's battery [V]
 _FRAMES = {"w": "world", "wb": "world", "b": "body", "c": "camera"}
-"""Frame of a channel by the end of its name."""
+"""Suffix of a channel's name -> its frame."""
 _MOTIONS = {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}
 
 
 @dataclass
 class Recognised:
-    """A channel, and what it was recognised by."""
+    """A recognised channel and the reason for its recognition."""
 
     entry: ChannelMap
     channel: Channel
@@ -76,31 +78,31 @@ class Path:
 
     @property
     def usual_name(self) -> str:
-        """Name of the channel by what its columns are called."""
+        """Name of the channel that the columns' names suggest."""
         if self.group.matches("estimate"):
             return "est_pos_w"
         return "mocap_pos_w" if self.group.matches("capture") else "pos_w"
 
 
 class Recognition:
-    """Decides which group of a table's columns is which channel.
+    """Assignment of channels to a table's groups of columns.
 
     Attributes:
-        questions: What neither names nor physics tell.
+        questions: What neither names nor physics determine.
     """
 
     def __init__(self, time: ndarray, groups: list[Group], settings: dict[str, str]):
-        """Take the groups that move, at stamps [s]; ``settings`` stand above a table's numbers."""
+        """Keep the groups that change; ``time``: stamps [s]; ``settings``: the table's header."""
         self.time = time
         self.settings = settings
         self.questions: list[str] = []
         for group in groups:
             group.values = np.where(find_lost_rows(group.values)[:, None], np.nan, group.values)
-        self._groups = [group for group in groups if moves(group.values)]  # that no channel has
+        self._groups = [group for group in groups if moves(group.values)]  # not yet a channel
         self._found: dict[str, Recognised] = {}
 
     def channels(self) -> list[Recognised]:
-        """Recognise what can be, the vehicle's attitude and path first."""
+        """Recognise all channels, the vehicle's attitude and path first."""
         self._quaternions()
         self._find_other_attitudes()
         self._positions()
@@ -114,7 +116,9 @@ class Recognition:
         return list(self._found.values())
 
     def _open(self, size: int, targets: bool = False) -> list[Group]:
-        """Groups of so many columns that no channel has; ``targets``: those of set-points too."""
+        """Return unassigned groups of ``size`` columns; ``targets``: whether to include set-
+        points.
+        """
         return [
             group
             for group in self._groups
@@ -122,13 +126,13 @@ class Recognition:
         ]
 
     def _find_hints(self, kind: str) -> list[Group]:
-        """Groups of three columns that no channel has and whose names hint at a kind."""
+        """Return unassigned groups of three columns whose names hint at a kind."""
         return [group for group in self._open(3) if group.hints_at(kind)]
 
     def _take(self, name: str, group: Group, unit: str, why: str, **options: Any) -> bool:
-        """Make a channel of a group, unless its units contradict what the name stands for;
-        ``options``: of its :class:`ChannelMap`.
-        """
+        """Make a channel of a group, unless its unit contradicts the channel's quantity.
+
+        ``options``: of the :class:`ChannelMap`. Returns whether the channel was made."""
         if name in self._found:
             return False
         values = group.values
@@ -160,7 +164,7 @@ class Recognition:
             self._take(name, group, "1", why, kind="quaternion", order=order)
 
     def _find_other_attitudes(self) -> None:
-        """Attitudes as rotation matrices, rotation vectors or angles."""
+        """Recognise attitudes as rotation matrices, rotation vectors or angles."""
         for group in self._open(9):
             if group.matches("rotation") and not group.matches("not_vehicle"):
                 self._take("quat_wb", group, "1", "nine columns of a rotation", kind="matrix")
@@ -179,7 +183,7 @@ class Recognition:
                 )
 
     def _attitudes(self) -> list[Attitude]:
-        """All ways to read the columns of the vehicle's attitude."""
+        """Return all possible readings of the columns of the vehicle's attitude."""
         if "quat_wb" not in self._found:
             return [NO_ATTITUDE]
         entry = self._found["quat_wb"].entry
@@ -217,9 +221,10 @@ class Recognition:
         return ways
 
     def _leans_by_accelerometers(self, attitude: Channel, axes: str) -> bool:
-        """Return whether an attitude, whose body has these axes, turns the mean force of every
-        accelerometer away from up, where it points over a flight.
-        """
+        """Return whether every accelerometer's mean force, which is vertical over a flight, is
+        tilted by this attitude.
+
+        ``axes``: of the body."""
         attitudes = attitude.samples()
         groups = self._find_hints("acc_b")
         for group in groups:
@@ -234,7 +239,7 @@ class Recognition:
         smooth = [g for g in self._open(3) if self._smooth(g) and g.unit not in ("deg", "rad")]
         groups = [g for g in smooth if g.hints_at("position") or g.unit in LENGTHS]
         unnamed = [g for g in smooth if not any(hint.search(g.stem) for hint in HINTS.values())]
-        if not groups and unnamed:  # no name speaks of a place
+        if not groups and unnamed:  # no name hints at a position
             groups = unnamed
             listed = "; ".join(group.listed for group in groups)
             self.questions.append(f"are these positions? Names do not say: {listed}")
@@ -267,20 +272,20 @@ class Recognition:
             self._take_path("payload_pos_w", lower, why)
 
     def _take_path(self, name: str, path: Path, why: str) -> bool:
-        """Make a channel of a path."""
+        """Make a channel of a path; see :meth:`_take`."""
         return self._take(name, path.group, path.unit, why + path.why, axes=self._up())
 
     def _up(self) -> str:
-        """Axes of the world, as the attitude has them."""
+        """Return the world's axes, as in the attitude."""
         return self._found["quat_wb"].entry.axes if "quat_wb" in self._found else ""
 
     def _body(self) -> str:
-        """Axes of what is measured on board: an autopilot's, where its attitude has them."""
+        """Return the axes of measurements on board: an autopilot's if its attitude has them."""
         return NED if self._up() == NED else ""
 
     def _paths(self, groups: list[Group]) -> list[Path]:
-        """Settle the units of paths and the reading of the attitude together: those that fit best
-        what a lean, a fall and a hall make of a path. What leaves several is asked about.
+        """Choose the units of paths and the reading of the attitude together, by tilt, free fall
+        and the size of a hall; ask about those that remain ambiguous.
         """
         attitudes = self._attitudes()
         ranked = [readings(self.time, group.values, _lengths(group), attitudes) for group in groups]
@@ -304,11 +309,11 @@ class Recognition:
         return paths
 
     def _path(self, group: Group, unit: str, why: str = "") -> Path:
-        """Return the path that a group's columns are in a unit."""
+        """Return the path of a group whose columns are in a unit."""
         return Path(group, unit, UNITS[unit][1] * group.values @ turn_to(self._up()), why)
 
     def _settle_attitude(self, ranked: list[PathReading]) -> None:
-        """Take the likeliest way to read the attitude; ask where no path says which one is."""
+        """Take the likeliest reading of the attitude; ask if no path determines it."""
         best, *others = ranked
         rivals = [r for r in others if r.attitude is not best.attitude]
         recognised = self._found["quat_wb"]
@@ -329,8 +334,10 @@ class Recognition:
     def _payload(
         self, paths: list[Path], unnamed: list[Group]
     ) -> tuple[Path | None, Path, str] | None:
-        """Find the path below another one that keeps its distance from it, or what nothing names
-        and does so in its unit. Returns that other one, the path and the reason.
+        """Find the payload: a path, or an unnamed group, at a constant distance below another path.
+
+        Returns the upper path, the payload's path and the reason; the upper one is None if the only
+        path is a payload by its name.
         """
         best = None
         rows = slice(None, None, max(1, len(self.time) // _COMPARED))
@@ -360,9 +367,9 @@ class Recognition:
         return bool(step < 0.3 * width)
 
     def _drop_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
-        """Return the groups that are no derivative of another path; of captures with many markers
-        all pairs are compared in one product.
-        """
+        """Return the groups that are no derivative of another path.
+
+        All pairs are compared in one matrix product, because captures may have many markers."""
         grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
         if not groups or len(grid) < 25:
             return groups
@@ -373,7 +380,7 @@ class Recognition:
         return [
             group
             for group, column in zip(groups, firm.T)
-            if group.unit in LENGTHS  # a length is no velocity, whatever it goes with
+            if group.unit in LENGTHS  # a length is no velocity, despite a correlation
             or not any(hit and path is not group for hit, path in zip(column, paths))
         ]
 
@@ -383,8 +390,8 @@ class Recognition:
     def _best(
         self, derived: Samples, groups: list[Group]
     ) -> tuple[relations.Relation, Group] | None:
-        """Return the group that goes best with what was derived of others, and how; None where none
-        does.
+        """Return the group that correlates best with a derived signal, and their relation; None if
+        none does.
         """
         best = None
         for group in groups:
@@ -413,9 +420,11 @@ class Recognition:
             self._take(name.replace("pos", "vel"), group, unit, why, axes=self._up())
 
     def _body_velocity(self, in_world: float) -> bool:
-        """Take a velocity that is the path's in the body's axes rather than in the world's, where
-        it goes together with the path by a correlation.
-        """
+        """Make a channel of a velocity in the body's axes, if it follows the path better than one
+        in the world's axes.
+
+        ``in_world``: correlation of the best velocity in the world's axes. Returns whether the
+        channel was made."""
         if "quat_wb" not in self._found:
             return False
         time, slope = self._found["pos_w"].channel.samples().derivative(_SPAN)
@@ -511,9 +520,9 @@ class Recognition:
                     )
 
     def _thrust(self) -> None:
-        """Take the collective thrust, a command before what else bears its name, a word before a
-        letter, which may be of a temperature.
-        """
+        """Recognise the collective thrust.
+
+        Commands have priority, and words over letters, since "t" may be a temperature."""
         groups = []
         for group in self._open(1, targets=True):
             if PATTERNS["thrust"].search(split_unit(group.stem)[0]):
@@ -553,35 +562,37 @@ class Recognition:
 
 
 def _lengths(group: Group) -> tuple[str, ...]:
-    """Units that a path may be in: as named, or all."""
+    """Return the units that a path may have: the named one, or all."""
     return (group.unit,) if group.unit in LENGTHS else LENGTHS
 
 
 def _angle_unit(group: Group) -> str:
-    """Return the unit of angles, as named, else by how far they reach."""
+    """Return the unit of angles: the named one, else by their range."""
     if group.unit in ("deg", "rad"):
         return group.unit
     return "deg" if group.reach > _TURN else "rad"
 
 
 def _has_letters(group: Group) -> bool:
-    """Whether the names of a quaternion's columns say which is w."""
+    """Return whether the names of a quaternion's columns state which is w."""
     return any("w" in split_unit(column)[0].lower()[-3:] for column in group.columns)
 
 
 def _normalise(values: ndarray) -> ndarray:
-    """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
+    """Return values minus their column's mean, as one vector of length 1; zeros if all are
+    constant.
+    """
     centred = (values - values.mean(0)).ravel()
     return centred / max(np.linalg.norm(centred), 1e-300)
 
 
 def _interpolate(samples: Samples, grid: ndarray) -> ndarray:
-    """Return a group's values at times of a grid, zeros where too few are known."""
+    """Return a group's values at the times of a grid; zeros if it has fewer than 100 samples."""
     if len(samples.time) < 100:
         return np.zeros((len(grid), 3))
     return samples.at(grid)
 
 
 def _size(samples: Samples) -> float:
-    """Root mean square about the means of the columns."""
+    """Return the root mean square about the means of the columns."""
     return np.sqrt(samples.values.var(0).mean())

@@ -1,4 +1,4 @@
-"""Units that no name says, by physics: what a path does against gravity, what a hall holds, what a
+"""Units determined by physics: by gravity in a path, by the size of a hall, and by the mass that a
 thrust carries.
 """
 
@@ -23,78 +23,76 @@ from visthrow.logs.samples import Samples
 from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 LENGTHS = ("m", "mm", "cm")
-"""Units of a path, the usual ones first."""
+"""Units of a path, most common first."""
 THRUSTS = ("N", "gf", "mN", "kgf")
-"""Units of a thrust, the usual ones first."""
+"""Units of a thrust, most common first."""
 LIGHTEST = 0.01
-"""Of what is tracked and flies by four rotors [kg]: from 10 up a number of kilograms may be one of
-grams.
-"""
+"""Lightest tracked quadrotor [kg]: from 10 up, a number that should be kilograms may be grams."""
 SURE = 5.0
-"""Nats by which a reading must beat all others: odds of 148 to 1."""
+"""Nats by which a reading must be ahead of all others: odds of 148 to 1."""
 
-# of the logarithm of what a vehicle accelerates by over what its lean makes: those of 13 recorded
-# flights lie from 0.7 to 1.4
+# standard deviation of the log ratio of measured acceleration to that by tilt: the ratios of 13
+# recorded flights are from 0.7 to 1.4
 _SCATTER = 0.17
-# over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of
-# 0.3 deg [s]
+# span over which a path is differentiated [s]: noise of motion capture of 1 mm causes 0.05 m/s^2,
+# as much as a tilt of 0.3 deg
 _SPAN = 0.2
-_DECADES = 0.5  # half of the least step between two lengths
-_LEANS = 0.02  # least acceleration of a lean that says something: 0.1 deg [m/s^2]
-_FALLS = 0.15  # of gravity, that a fall may be off by: drag of a light ball
-# of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of
-# 13 flights in any unit
+_DECADES = 0.5  # half of the smallest log10 ratio between units of length
+_LEANS = 0.02  # smallest informative acceleration by tilt, that of 0.1 deg [m/s^2]
+_FALLS = 0.15  # largest deviation of free fall from gravity, relative to it: drag of a light ball
+# smallest share of a path in free fall for a thrown object: two recorded throws have 0.18 and 0.21,
+# 13 flights at most 0.05 in any unit
 _SHARE = 0.1
-_HALL = (0.1, 60.0)  # what a path in a hall reaches from the origin of the capture [m]
-# nats against a unit in which a path leaves a hall or does not fall as it falls
+_HALL = (0.1, 60.0)  # range of a path's largest distance from the capture's origin in a hall [m]
+# nats against a unit in which a path leaves a hall, or its free fall does not have gravity
 _OUTSIDE = 15.0
-_BELOW = 4.0  # nats against an attitude by which a path stays below the floor
-_FAR = 2.5  # deviations beyond which doubt grows with the distance alone: more than a lean may push
+_BELOW = 4.0  # nats against an attitude whose axes put a path below the floor
+_FAR = 2.5  # deviations from which on the nats grow linearly
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """One way to read the columns of an attitude."""
+    """A possible reading of the columns of an attitude."""
 
     entry: ChannelMap
     channel: Channel
-    doubt: float  # nats against it before any path is looked at
-    words: str = ""  # by which it differs from the other ways; "" where there is only one
+    doubt: float  # nats against it before any path is considered
+    words: str = ""  # its difference from other readings; "" if it is the only one
 
     @property
     def kind(self) -> tuple[str, str, tuple[str, ...]]:
-        """Order of a quaternion, axes of the world and signs: all but the unit of angles."""
+        """Order of a quaternion, axes of the world and signs; not the unit of angles."""
         return self.entry.order, self.entry.axes, self.entry.columns
 
 
 _NEVER = Channel(np.empty(0), np.empty((0, 4)), "1")
 NO_ATTITUDE = Attitude(ChannelMap("none", ("none",), "1"), _NEVER, doubt=0.0)
-"""Of a vehicle none of whose columns is an attitude."""
+"""Placeholder for a table without an attitude."""
 
 
 @dataclass(frozen=True)
 class PathReading:
-    """One way to read the columns of a path, beside an attitude."""
+    """A possible reading of the columns of a path, together with one of the attitude."""
 
     unit: str
     attitude: Attitude
-    doubt: float  # nats against it, less those of other readings of the same path
+    doubt: float  # nats against it; only differences between readings of a path matter
     why: str
 
     @property
     def words(self) -> str:
-        """Unit, and the attitude's reading where there are several."""
+        """Unit, and the attitude's reading if there are several."""
         way = self.attitude.words
         return f"'{self.unit}'" + (f" with {way}" if way else "")
 
 
 class Lean(NamedTuple):
-    """A path's motion beside the lean of an attitude."""
+    """The relation between a path's acceleration and the tilt of an attitude."""
 
-    size: float  # what the lean accelerates it by [m/s^2]
-    times: float  # how many times that it accelerates by in its own unit; 0: not known
-    correlation: float  # of the two
-    nats: float  # for their going together
+    size: float  # root mean square acceleration by tilt [m/s^2]
+    times: float  # ratio of the path's acceleration, in its unit, to that by tilt; 0: unknown
+    correlation: float  # of the two accelerations
+    nats: float  # evidence for their correlation
 
 
 NO_LEAN = Lean(0.0, 0.0, 0.0, 0.0)
@@ -103,32 +101,32 @@ NO_LEAN = Lean(0.0, 0.0, 0.0, 0.0)
 def readings(
     time: ndarray, path: ndarray, units: Iterable[str], attitudes: Iterable[Attitude]
 ) -> list[PathReading]:
-    """Weigh all readings of a path, the likeliest first.
+    """Return all readings of a path, the likeliest first.
 
-    Level, a rotor's lean accelerates by about g sin(tilt); what is thrown falls with g; and a path
-    stays in a hall.
+    In level flight, a tilt causes an acceleration of about g sin(tilt); a thrown object falls with
+    g; and a path is within a hall.
 
     Args:
         time: Stamps of the path [s], shape (T,).
-        path: The path in its unknown unit, shape (T, 3).
-        units: Units of length that are tried.
+        path: Path in its unknown unit, shape (T, 3).
+        units: Units of length to try.
         attitudes: Readings of the vehicle's attitude.
     """
     reach = np.nanmax(np.abs(path))
     in_hall = fitting_units(reach, units, *_HALL)
     fall = find_unit_by_fall(time, path)
     leans = [_weigh_by_lean(time, path, way) for way in attitudes]
-    together = defaultdict(float)  # by kind: angles in whatever unit
+    together = defaultdict(float)  # best evidence by kind, over units of angles
     for attitude, lean in zip(attitudes, leans):
         together[attitude.kind] = max(together[attitude.kind], lean.nats)
-    decades = []  # of what a lean makes, by which a unit is off
+    decades = []  # log10 ratios of the path's acceleration in a unit to that by tilt
     for lean, unit in product(leans, units):
         if lean.times > 0.0:
             decades.append(abs(np.log10(UNITS[unit][1] * lean.times)))
     leaning = min(decades, default=np.inf) < _DECADES and max(x.size for x in leans) > _LEANS
     correlation = max((lean.correlation for lean in leans if lean.nats >= SURE), default=0.0)
     leaning = leaning and correlation > 0.0
-    slack = -np.log(correlation) if leaning else 0.0  # by which noise of either changes their ratio
+    slack = -np.log(correlation) if leaning else 0.0  # change of the log ratio by noise
     listed = []
     for attitude, lean in zip(attitudes, leans):
         height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
@@ -150,7 +148,7 @@ def readings(
 
 
 def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
-    """Weigh a path against the lean that an attitude gives it."""
+    """Compare a path's acceleration with the one that an attitude's tilt causes."""
     attitudes = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
     stamps, acc = physics.accelerations(select_rising(time, turned), "m", _SPAN)
@@ -171,19 +169,19 @@ def _weigh_by_lean(time: ndarray, path: ndarray, attitude: Attitude) -> Lean:
 
 
 def _huber(deviations: float) -> float:
-    """Nats against a ratio so many deviations off."""
+    """Return the nats against a log ratio by its distance in standard deviations (Huber's loss)."""
     near = min(abs(deviations), _FAR)
     return near * (abs(deviations) - 0.5 * near)
 
 
 def turn_to(axes: str) -> ndarray:
-    """Return the matrix that turns rows about a source's axes into ours."""
+    """Return the matrix that rotates row vectors from a source's axes to this project's."""
     return turn_of(axes or OURS).T
 
 
 def find_unit_by_fall(time: ndarray, path: ndarray) -> str:
-    """Find the unit in which a part of a path falls freely: gravity along one axis and nothing
-    level; "" where none does.
+    """Find the unit in which a part of a path is in free fall, with gravity along one axis only; ""
+    if there is none.
     """
     acc = physics.accelerations(select_rising(time, path), "m").values
     if not len(acc):
@@ -198,22 +196,22 @@ def find_unit_by_fall(time: ndarray, path: ndarray) -> str:
 
 
 def find_unit_by_mass(carried: float, weighed: float, units: Iterable[str]) -> str:
-    """Find the unit of a thrust in which it carries what was weighed.
+    """Find the unit of a thrust in which it carries the weighed mass.
 
     Args:
-        carried: What it carries if it is in newtons [kg].
-        weighed: Mass of the vehicle [kg]; a payload and the charge of the battery may add to it or
-            take from it, by less than e.
-        units: Units that are tried.
+        carried: Mass that the thrust carries if it is in newtons [kg].
+        weighed: Mass of the vehicle [kg]; a payload and the battery's charge may change the carried
+            mass by less than a factor of e.
+        units: Units to try.
 
     Returns:
-        The unit, "" where none does.
+        The unit, "" if there is none.
     """
     unit, miss = nearest_unit(carried / weighed, units)
     return unit if miss < MASS_BAD else ""
 
 
 def select_rising(time: ndarray, path: ndarray) -> Samples:
-    """Rows that are numbers and leave the clock going on."""
+    """Return the finite rows of a path at which the clock moves forward."""
     rows = forward_rows(np.where(np.isfinite(path).all(1), time, np.nan))
     return Samples(time[rows], path[rows])
