@@ -1,4 +1,4 @@
 """Batched hybrid simulator of a quadrotor with a cable-suspended payload, in Warp.
 
-:class:`sim.hybrid.HybridSim` steps vehicle, rope and payload, or the vehicle alone;
-:mod:`sim.reference` is an independent plant on MuJoCo for a few vehicles."""
+:class:`sim.hybrid.HybridSim` simulates vehicle, rope and payload, or the vehicle alone.
+:mod:`sim.reference` is an independent plant on MuJoCo for small batches."""

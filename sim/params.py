@@ -1,10 +1,10 @@
 """Physical parameters of the vehicle, the rope and the release: frozen dataclasses, SI units.
 
-Each dataclass mirrors one TOML file of ``configs/``. The equations that the fields enter stand in
-the docstring of the class; the blocks of ``sim/kernels/quadrotor`` and ``sim/kernels/rope``
-implement them in Warp, ``sim/reference`` implements them again, independently, in float64. Every
-value below is documented as ``[unit]``; vectors are in the body frame (x forward, y left, z up)
-with the origin at the vehicle's centre of mass unless said otherwise."""
+Each dataclass is the schema of a TOML file or table of ``configs/``. Its docstring states the
+equations of its fields. The blocks of ``sim/kernels/quadrotor`` and ``sim/kernels/rope`` implement
+them in Warp; ``sim/reference`` is an independent implementation in float64. Units are in brackets.
+Unless stated otherwise, vectors are in the body frame (x forward, y left, z up) with the origin at
+the vehicle's centre of mass."""
 
 import math
 from collections.abc import Mapping
@@ -30,14 +30,14 @@ from camera.field_bounds import (
 from sim.law_factors import LAW_FACTORS
 
 GRAVITY = 9.81
-"""Standard acceleration of free fall used by every plant of the project [m/s^2]."""
+"""Acceleration of free fall in every plant [m/s^2]."""
 
 Owner = TypeVar("Owner")
 
 
 def change_values(owner: Owner, values: Mapping[str, Any]) -> Owner:
-    """Return a dataclass with other values at dotted paths, such as ``vehicle.queue.delay``; paths
-    within a table change the table that comes with them.
+    """Return a copy of a dataclass with new values at dotted paths, such as
+    ``vehicle.queue.delay``. If ``values`` also holds the table of a path, that table is changed.
     """
     fields: dict[str, Any] = {}
     tables: dict[str, dict[str, Any]] = {}
@@ -52,7 +52,7 @@ def change_values(owner: Owner, values: Mapping[str, Any]) -> Owner:
     return replace(owner, **fields)  # type: ignore[type-var]
 
 
-LEAST_GYRATION = 0.01  # radius of gyration of a vehicle over the reach of its rotors [-]
+LEAST_GYRATION = 0.01  # smallest radius of gyration over the reach of the rotors [-]
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class BodyParams(BoundedFields):
 class RotorParams(BoundedFields):
     """Geometry of the four rotors.
 
-    Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen
-    from above, so that its drag torque on the body points along +z."""
+    Rotor i is at ``r_i = (x_i, y_i, z)`` and has spin ``s_i``. With +1 it turns clockwise seen from
+    above, so that its drag torque on the body points along +z."""
 
     x: tuple[Arm, Arm, Arm, Arm]  # [m]
     y: tuple[Arm, Arm, Arm, Arm]  # [m]
@@ -85,8 +85,8 @@ class RotorParams(BoundedFields):
 
 @dataclass(frozen=True)
 class QueueParams(BoundedFields):
-    """Command queue: the command given at t acts from t + delay on, held until the next one
-    (zero-order hold).
+    """Command queue: a command of time t acts from t + delay until the next one (zero-order
+    hold).
     """
 
     delay: Lag  # tau_d, transmission and actuation [s]
@@ -102,37 +102,36 @@ class ControllerParams(BoundedFields):
     - ``r' = (w_cmd - r) / setpoint_time_constant``
     - ``g' = (w - g) / gyro_time_constant``
     - ``tau = p_gain (r - w) + i - d_gain g' + feedforward_gain r'``  (per axis, [N m])
-    - ``i' = i_gain (r - w)``; where it would grow an integral (``i' i > 0``) it is 0 at ``|i| >=
-      integral_limit`` and
-      otherwise scaled by the share of the demanded torque that the mixer delivers: roll and pitch
-          by their common scale,
-      yaw by clipped over wanted. (Continuous in the state: a hard hold while saturated makes
-      trajectories depend on the step.)
+    - ``i' = i_gain (r - w)``. If this increases the integral (``i' i > 0``), it is 0 at ``|i| >=
+      integral_limit`` and otherwise scaled by the share of the demanded torque that the mixer
+      delivers: for roll and pitch their common scale, for yaw clipped over demanded. (This is
+      continuous in the state; a hard hold during saturation would make trajectories depend on the
+      step.)
 
     Mixer: per-motor thrusts ``f_i = c/4 + roll_i + pitch_i + yaw_i`` with ``roll_i = tau_x y_i / (4
     ybar^2)``, ``pitch_i = -tau_y x_i / (4 xbar^2)``, ``yaw_i = tau_z s_i / (4 kappa)`` (``ybar^2``
     mean of y_i^2, ``xbar^2`` of x_i^2, kappa the nominal torque-to-thrust ratio). With D = f_max -
-    f_min: roll+pitch are scaled by D / range where their range exceeds D; then yaw is clipped to
-    what range D leaves; then the collective is shifted so that every f_i lies in [f_min, f_max].
+    f_min: roll+pitch are scaled by D / range if their range exceeds D; then yaw is clipped to the
+    remaining range; then the collective is shifted so that every f_i is in [f_min, f_max].
     ``f_max = max_thrust (u / u_ref)^2`` follows the battery voltage u. Motor-speed set-point:
     ``Omega* = sqrt(f_i / k_f) (1 + (1 - voltage_compensation) (u / u_ref - 1))``.
 
-    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): g has the lag of D, which
-    has filters of its own; P and I see a share of it, ``e = w_cmd - w - gyro_share (g - w)``. r is
-    the low-pass of ``iterm_relax`` alone, which holds the integral of roll and pitch while the
-    command moves: ``i' = i_gain e max(0, 1 - |w_cmd - r| / relax_threshold)``, 0 at the limit where
-    it would grow. The mixer adds to motor commands: with ``u_c = sqrt(c / (4 max_thrust))`` and m_i
-    the thrust that the mixer above gives a motor for tau, ``u_i = u_c + m_i / (2 sqrt(mix_thrust
-    max_thrust))``; all m_i are scaled where their range exceeds that from idle ``sqrt(min_thrust /
-    max_thrust)`` to 1, then u_c is shifted so that every u_i lies in it. The gains hold at
-    ``mix_thrust`` a motor; elsewhere the loop's gain goes with the square root of thrust. ``Omega*
-    = u_i sqrt(max_thrust / k_f)``, times the voltage's factor above with ``calibration_voltage``
-    for u_ref. Source: betaflight 4.6, src/main/flight/pid.c (applyItermRelax), mixer.c
-    (applyMixerAdjustment).
+    ``motor_mixing`` (Betaflight's firmware, without set-point smoothing): g has the lag of the D
+    term and its filters. P and I have a share of this lag, ``e = w_cmd - w - gyro_share (g - w)``.
+    r is used only for ``iterm_relax``, which holds the integral of roll and pitch during a change
+    of the command: ``i' = i_gain e max(0, 1 - |w_cmd - r| / relax_threshold)``, or 0 at the limit
+    if i would grow. The mixer adds to motor commands: with ``u_c = sqrt(c / (4 max_thrust))`` and
+    m_i the thrust of a motor for tau by the mixer above, ``u_i = u_c + m_i / (2 sqrt(mix_thrust
+    max_thrust))``. All m_i are scaled if their range exceeds the range from idle ``sqrt(min_thrust
+    / max_thrust)`` to 1, then u_c is shifted so that every u_i is in this range. The gains are
+    exact at a thrust of ``mix_thrust`` per motor; the loop gain is proportional to the square root
+    of thrust. ``Omega* = u_i sqrt(max_thrust / k_f)``, times the voltage factor above with
+    ``calibration_voltage`` in place of u_ref. Source: betaflight 4.6, src/main/flight/pid.c
+    (applyItermRelax), mixer.c (applyMixerAdjustment).
 
     ``geometric`` (the ablation): ``tau = geometric_gain J (w_cmd - w) + w x J w`` without filters,
-    integral or voltage; f_i clipped one by one to [f_min, max_thrust]; ``Omega* = sqrt(f_i /
-    k_f)``."""
+    integral or voltage; each f_i is clipped to [f_min, max_thrust]; ``Omega* = sqrt(f_i / k_f)``.
+    """
 
     kind: Literal["betaflight", "motor_mixing", "geometric"]
     p_gain: NotNegativeVector  # [N m s/rad]
@@ -142,17 +141,17 @@ class ControllerParams(BoundedFields):
     integral_limit: NotNegativeVector  # [N m]
     setpoint_time_constant: Duration  # [s]
     gyro_time_constant: Duration  # [s]
-    min_thrust: NotNegative  # f_min a motor, idle [N]
-    max_thrust: Positive  # f_max a motor at u_ref [N]
+    min_thrust: NotNegative  # f_min of a motor, at idle [N]
+    max_thrust: Positive  # f_max of a motor, at u_ref [N]
     voltage_compensation: float  # 0: none, 1: full [-]
     geometric_gain: NotNegative  # [1/s]
-    # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
+    # thrust of a motor at which the gains of ``motor_mixing`` are exact [N]: hover with the payload
     mix_thrust: Positive = 0.667
-    # at which a command of ``motor_mixing`` gives the thrust that it names [V]
+    # voltage at which ``motor_mixing`` delivers the commanded thrust [V]
     calibration_voltage: Positive = 15.2
-    # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
+    # threshold of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
     relax_threshold: Positive = 0.698
-    # of the lag of g that P and I of ``motor_mixing`` see [-]
+    # share of the lag of g in P and I of ``motor_mixing`` [-]
     gyro_share: NotNegativeVector = (1.0, 1.0, 1.0)
 
 
@@ -163,17 +162,16 @@ class MotorParams(BoundedFields):
     ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*``
     (``instant``).
 
-    ``asymmetric``: first order with ``time_constant_down`` where the set-point lies below the
-    speed."""
+    ``asymmetric``: first order, with ``time_constant_down`` if the set-point is below the speed."""
 
     kind: Literal["first_order", "instant", "asymmetric"]
     time_constant: Positive  # [s]
-    time_constant_down: NotNegative = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
+    time_constant_down: NotNegative = 0.0  # of slowing down, only for ``asymmetric`` [s]
 
 
 @dataclass(frozen=True)
 class BatteryParams(BoundedFields):
-    """Battery of one pack.
+    """Battery.
 
     State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i /
     efficiency`` with ``tau_i`` the aerodynamic rotor torque ``kappa f_i``; current ``I = P / u``;
@@ -188,7 +186,7 @@ class BatteryParams(BoundedFields):
     time_constant: Positive  # of the load-dependent sag [s]
     idle_power: NotNegative  # P_0, electronics [W]
     efficiency: Positive  # motor and speed controller [-]
-    reference_voltage: Positive  # u_ref: voltage at which the thrust map was taken [V]
+    reference_voltage: Positive  # u_ref: voltage at which the thrust map was measured [V]
 
 
 @dataclass(frozen=True)
@@ -196,29 +194,28 @@ class ThrustParams(BoundedFields):
     """Thrust and torque of rotor i from its speed and the battery voltage.
 
     ``f_i = gain_i (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``,
-    ``tau_i = torque_ratio torque_gain f_i``. The controller knows of neither gain.
+    ``tau_i = torque_ratio torque_gain f_i``. The controller uses neither gain.
     """
 
     k_f: Positive  # thrust coefficient [N s^2/rad^2]
     k_1: float  # linear term [N s/rad]
     voltage_coefficient: float  # [1/V]
     torque_ratio: NotNegative  # kappa [m]
-    # of each rotor against the controller's map [-]
+    # thrust of each rotor relative to the controller's map [-]
     gain: tuple[Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0)
-    torque_gain: Positive = 1.0  # of the drag torque likewise [-]
+    torque_gain: Positive = 1.0  # drag torque relative to the controller's map [-]
 
 
 @dataclass(frozen=True)
 class AeroParams(BoundedFields):
-    """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and
-    the rate w.
+    """Aerodynamics of the vehicle as a function of the centre of mass's air velocity v_b and the
+    rate w.
 
     - rotor drag: ``dF = -(drag_x v_x, drag_y v_y, drag_z v_z)``
     - body drag: ``dF += -parasitic |v| v``
     - inflow on rotor i, with its hub velocity ``v_i = v_b + w x r_i``:
-      ``df_i = f_i (-inflow v_iz + translational_lift (v_ix^2 + v_iy^2))``, added to the thrust with
-      its arm, and to the rotor's drag torque by ``-torque_inflow`` in place of ``-inflow``:
-      ``dtau_i = kappa f_i (-torque_inflow v_iz)``
+      ``df_i = f_i (-inflow v_iz + translational_lift (v_ix^2 + v_iy^2))`` adds to the thrust, at
+      the rotor's arm, and ``dtau_i = kappa f_i (-torque_inflow v_iz)`` to the rotor's drag torque
     - blade flapping: ``dtau = flapping T (e_z x v_b)`` with T the sum of f_i.
 
     ``none``: all of it zero (the ablation).
@@ -239,15 +236,15 @@ class AeroParams(BoundedFields):
 class VehicleParams(BoundedFields):
     """A quadrotor: the seven blocks of Table I of the paper and the rigid body.
 
-    The composer adds them up: ``F_b = (0, 0, sum f_i) + dF``,
+    The composer adds the blocks' forces and torques: ``F_b = (0, 0, sum f_i) + dF``,
     ``tau_b = sum_i r_i x (0, 0, f_i + df_i) + e_z sum_i s_i (tau_i + dtau_i + J_r Omega_i') - w x
     e_z h + dtau`` with the rotors' momentum ``h = -J_r sum_i s_i Omega_i`` (the gyroscopic torque
     does no work). A rotor that turns clockwise from above (s_i = +1) has angular momentum along -z
     and pushes the body towards +z.
 
-    Rotors and mount are stated from the frame's origin, where the centre of mass is meant to be.
-    Where ``body.com`` says that it is elsewhere, they act with their arms about it, while the
-    controller's mixer keeps to the frame."""
+    Positions of rotors and mount are relative to the frame's origin, which is nominally the centre
+    of mass. If ``body.com`` is not zero, forces act with their arms about the true centre of mass,
+    but the controller's mixer uses the arms about the origin."""
 
     body: BodyParams
     rotors: RotorParams
@@ -261,7 +258,7 @@ class VehicleParams(BoundedFields):
     collision_radius: NotNegative
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a vehicle that the equations do not describe."""
+        """Raise ValueError for a vehicle that is physically impossible."""
         mass = self.body.mass
         super().__post_init__()
         c = self.controller
@@ -298,22 +295,22 @@ class VehicleParams(BoundedFields):
 class RopeParams(BoundedFields):
     """Rope of rigid slender segments on universal joints, and the payload rigidly on the last one.
 
-    Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass
-    in the middle, transverse inertia ``m l^2 / 12`` about it, none about its axis. The payload's
-    centre lies ``payload_offset`` past the end of the last segment, on its axis. Viscous joint
-    torque ``-joint_damping (w_i - w_(i-1))`` in every joint, the one on the vehicle included; in
-    the uppermost one ``mount_damping`` besides.
+    A segment has length ``length / segments`` and mass ``rope_mass / segments``. Its centre of mass
+    is in the middle, its transverse inertia about it is ``m l^2 / 12`` and its axial inertia 0. The
+    payload's centre is on the axis of the last segment, ``payload_offset`` beyond its end. Every
+    joint, including the mount, has the viscous torque ``-joint_damping (w_i - w_(i-1))``; the mount
+    has ``mount_damping`` in addition.
 
-    Air on the payload, with its velocity v_p through the air: ``-payload_drag |v_p| v_p``. While it
-    hangs, the rotors' jet pushes it with the share ``downwash`` of their force, against that force,
-    and friction holds it back by ``-swing_damping`` times its velocity v across the rope's last
-    segment. In free flight a spinning or seamed ball is pushed besides by ``|v_p| (payload_side e_z
-    x v_p + payload_lift v_p x e_a)`` with ``e_a`` the horizontal direction across its path, ``e_z x
-    v_p`` normalised.
+    The drag of the payload at the air velocity v_p is ``-payload_drag |v_p| v_p``. While it hangs,
+    the rotors' downwash pushes it with the share ``downwash`` of their force, in the opposite
+    direction, and ``-swing_damping`` times its velocity across the rope's last segment damps its
+    swing. In free flight, a spinning or seamed ball has the additional force ``|v_p| (payload_side
+    e_z x v_p + payload_lift v_p x e_a)`` with ``e_a`` the horizontal direction across its path,
+    ``e_z x v_p`` normalised.
 
-    A rope that gives lengthens by ``compliance`` times its pull T at the mount, evenly along it:
-    ``l = l_0 (1 + compliance T / length)``. It does so at once: what swings is slow against the
-    bounce of the payload on the rope (20 Hz at 1 mm/N), whose own inertia is left out."""
+    An elastic rope stretches uniformly by ``compliance`` times its pull T at the mount: ``l = l_0
+    (1 + compliance T / length)``. This is quasi-static: the swing is slow compared with the bounce
+    of the payload on the rope (20 Hz at 1 mm/N), whose dynamics are neglected."""
 
     segments: int  # L, 1 to 64
     length: Length  # of the rope, without the payload [m]
@@ -326,17 +323,17 @@ class RopeParams(BoundedFields):
     mount: Vector  # rope attachment in the body frame [m]
     # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     payload_drag: NotNegative = 0.0
-    mount_damping: NotNegative = 0.0  # of the uppermost joint, besides joint_damping [N m s]
+    mount_damping: NotNegative = 0.0  # of the joint at the mount, plus joint_damping [N m s]
     swing_damping: NotNegative = 0.0  # [N s/m]
     downwash: NotNegative = 0.0  # [-]
     payload_side: float = 0.0  # 1/2 rho C_L A across the path, in flight [kg/m]
-    payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
-    compliance: NotNegative = 0.0  # lengthening for every newton of pull [m/N]
-    # of a box that swings about its upper face, homogeneous [m]; 0: a ball, rigid on the rope
+    payload_lift: float = 0.0  # 1/2 rho C_L A upwards in the path's vertical plane [kg/m]
+    compliance: NotNegative = 0.0  # elongation over pull [m/N]
+    # sides of a homogeneous box that swings about its upper face [m]; 0: a ball, rigid on the rope
     payload_sides: NotNegativeVector = (0.0, 0.0, 0.0)
-    # of two cables without mass, along body x, that hold the box in the rope's place [m]; 0: a rope
+    # distance along body x of two massless cables that replace the rope of a box [m]; 0: a rope
     cables_apart: NotNegative = 0.0
-    gripper_mass: NotNegative = 0.0  # at the rope's lower end, which holds the payload [kg]
+    gripper_mass: NotNegative = 0.0  # of the gripper at the rope's lower end [kg]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -371,8 +368,8 @@ class RopeParams(BoundedFields):
         return self.rope_mass / self.segments
 
     def rod(self, loaded: bool) -> Vector:
-        """Return a segment's mass [kg], its centre of mass below the upper end [m] and its
-        transverse inertia about that [kg m^2]; the payload is part of a ``loaded`` one.
+        """Return a segment's mass [kg], the distance of its centre of mass from its upper end [m]
+        and its transverse inertia about it [kg m^2]; a ``loaded`` segment includes the payload.
         """
         mass = self.segment_mass
         length = self.segment_length
@@ -388,12 +385,12 @@ class RopeParams(BoundedFields):
 
     @property
     def hanging_mass(self) -> float:
-        """Mass of rope, gripper and payload [kg]; two cables have none."""
+        """Mass of rope, gripper and payload [kg]; two cables are massless."""
         rope = 0.0 if self.cables_apart else self.rope_mass
         return rope + self.gripper_mass + self.payload_mass
 
     def require_chain(self, owner: str) -> None:
-        """Raise ValueError where something else hangs on the vehicle than a chain with a ball."""
+        """Raise ValueError if anything but a chain with a ball hangs on the vehicle."""
         for name in ("payload_sides", "cables_apart", "gripper_mass"):
             value = getattr(self, name)
             if value not in (0.0, (0.0, 0.0, 0.0)):
@@ -405,13 +402,13 @@ class RopeParams(BoundedFields):
 
 @dataclass(frozen=True)
 class AirParams(BoundedFields):
-    """The air that vehicle and payload move in:
+    """Wind and ground effect.
 
-    ``v_air = v - wind_w``, in the place of v in every force of the air.
+    In every aerodynamic force, ``v_air = v - wind_w`` replaces v.
 
-    Near the ground every rotor gains thrust: ``f_i`` times ``1 + ground_effect (1 / (1 - (R / 4
-    z)^2) - 1)`` with R the propeller's radius and z the height of the vehicle's centre of mass, not
-    below R / 2 (Cheeseman and Bennett 1955 for ``ground_effect`` 1)."""
+    Near the ground every rotor's thrust ``f_i`` is multiplied by ``1 + ground_effect (1 / (1 - (R /
+    4 z)^2) - 1)`` with R the propeller's radius and z the height of the vehicle's centre of mass,
+    at least R / 2 (Cheeseman and Bennett 1955 for ``ground_effect`` 1)."""
 
     wind_w: Vector = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
     ground_effect: float = 0.0  # [-]
@@ -419,29 +416,29 @@ class AirParams(BoundedFields):
 
 @dataclass(frozen=True)
 class ReleaseParams(BoundedFields):
-    """Release mechanism and the flight that follows.
+    """Release mechanism and the payload's free flight.
 
-    The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload
-    separates ``lag`` later; with ``lag_tension``, ``lag + lag_tension (pull - m_p g)`` later, not
-    below 0, with the rope's pull at the latch. From the payload's position p and velocity v at
-    separation: ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; under drag the
+    The latch trips when the release command exceeds ``threshold``, and stays tripped. The payload
+    separates after ``lag``; with ``lag_tension``, after ``lag + lag_tension (pull - m_p g)``, at
+    least 0, where pull is the rope's pull at the latch. With the payload's position p and velocity
+    v at separation, ``t_hit = (v_z + sqrt(v_z^2 + 2 g (p_z - landing_height))) / g``; with drag the
     flight is integrated by RK4.
 
-    A rope that leaves with the payload shares its momentum: in the mean the payload flies on with
-    ``v + rope_tail (v_c - v)``, v_c the velocity of the common centre of mass. The replay flies the
-    loose rope itself."""
+    A rope that separates together with the payload exchanges momentum with it. The payload's mean
+    velocity becomes ``v + rope_tail (v_c - v)``, v_c the velocity of the common centre of mass. The
+    replay simulates the loose rope instead."""
 
     threshold: float  # [-]
     lag: Lag  # [s]
     landing_height: float  # z of the payload's centre at impact [m]
-    clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
+    clearance_samples: int  # K points of the flight at which the distance to the vehicle is tested
     clearance_margin: NotNegative  # d_m [m]
-    # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
+    # additional lag over the rope's pull at the latch in excess of the payload's weight [s/N]
     lag_tension: float = 0.0
-    # speed that the mechanism gives the payload, world frame [m/s]
+    # change of the payload's velocity by the mechanism, world frame [m/s]
     kick_w: Vector = (0.0, 0.0, 0.0)
-    kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
-    rope_tail: Share = 0.0  # share of the rope that leaves with the payload [-]
+    kick_along: float = 0.0  # along the rope's last segment, away from the vehicle [m/s]
+    rope_tail: Share = 0.0  # share of the rope that separates with the payload [-]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -458,24 +455,24 @@ class SimParams(BoundedFields):
     control_period: Duration  # of the policy [s]
     substep: Duration  # largest integration step [s]
     gamma: Positive  # of the ROS2 W-method [-]
-    # a segment that turns more in one substep falls back to the first stage [rad]
+    # if a segment rotates more in a substep, the step falls back to the first stage [rad]
     max_turn: Positive
     precision: Literal["float32", "float64"] = "float32"
-    # engine of the bodies: the fused kernel, or one of sim.solvers.SOLVERS
+    # solver of the bodies: the fused kernel, or one of sim.solvers.SOLVERS
     solver: Literal["chain", "exchanged_chain", "physx", "mujoco_warp"] = "chain"
 
 
-MOST_FACTORS = 2  # of a law
+MOST_FACTORS = 2  # largest number of factors of a law
 
 
 @dataclass(frozen=True)
 class LawParams(BoundedFields):
-    """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the
-    names of :mod:`sim.kernels.laws`.
+    """A force or torque in addition to those of the blocks: the product of a coefficient, scalars
+    and a vector that :mod:`sim.kernels.laws` defines by name.
 
-    It acts on the vehicle (force in the world frame, torque in the body's), on the payload, while
-    it hangs and after, or in the rope's joint at the mount: a torque on the vehicle in the body
-    frame, and the opposite one on the rope."""
+    It acts on the vehicle (force in the world frame, torque in the body frame), on the payload
+    (hanging and in free flight), or in the rope's joint at the mount (torque on the vehicle in the
+    body frame, and the opposite one on the rope)."""
 
     block: Literal["vehicle force", "vehicle torque", "payload force", "rope joint"]
     factors: tuple[str, ...]  # up to two scalars
@@ -506,14 +503,14 @@ class LawParams(BoundedFields):
                 )
 
 
-LOWEST = 0.05  # height below which a law's 1/z is held [m]
-# rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
+LOWEST = 0.05  # height below which a law's 1/z is constant [m]
+# rate of the rope relative to the vehicle below which a law's dry friction decreases to 0 [1/s]
 SLOWEST = 0.1
 
 
 @dataclass(frozen=True)
 class PlantParams:
-    """All that defines one simulated plant."""
+    """All parameters of a simulated plant."""
 
     vehicle: VehicleParams
     rope: RopeParams
@@ -524,32 +521,32 @@ class PlantParams:
 
     @property
     def total_mass(self) -> float:
-        """Mass of the vehicle with all that hangs on it [kg]."""
+        """Mass of vehicle, rope, gripper and payload [kg]."""
         return self.vehicle.body.mass + self.rope.hanging_mass
 
 
 @dataclass(frozen=True)
 class SensingParams(BoundedFields):
-    """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
+    """Errors of motion capture, gyro and camera in a log. All zero: ideal sensors.
 
-    With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of
-    ``marker_rotation`` and the body's attitude R, a sample that carries the stamp t shows the state
-    at ``t - delay - clock_rate (t - start of the flight)``, with the delay of its channel:
+    A sample with the stamp t measures the state at ``t - delay - clock_rate (t - start of the
+    flight)``, with the delay of its channel. With the rotations F of ``frame_tilt`` and M of
+    ``marker_rotation`` and the attitude R:
 
-    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; the
-      origin is that of the frame the vehicle's parameters are stated in, not the centre of mass
+    - vehicle: ``p = (1 + scale) F (p_origin + R marker_offset)``, ``R_measured = F R M``; p_origin
+      is the origin of the frame of the vehicle's parameters, not the centre of mass
     - payload: ``p = (1 + scale) F (p_payload + payload_offset)``
     - gyro: ``w = w_b + gyro_bias``
-    - camera: keypoints with the stamp t show the scene at ``t - camera_delay + camera_line_time *
+    - camera: a keypoint with the stamp t shows the scene at ``t - camera_delay + camera_line_time *
       row``
     """
 
     vehicle_delay: float = 0.0  # of the vehicle's stamps [s]
     payload_delay: float = 0.0  # of the payload's stamps [s]
     gyro_delay: float = 0.0  # [s]
-    clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
-    scale: float = 0.0  # of measured lengths [-]
-    # world against the measured frame [rad]
+    clock_rate: float = 0.0  # rate error of the sensors' clock relative to the commands' [-]
+    scale: float = 0.0  # relative error of measured lengths [-]
+    # rotation vector from the world to the measured frame [rad]
     frame_tilt: Vector = (0.0, 0.0, 0.0)
     marker_rotation: Vector = (0.0, 0.0, 0.0)  # [rad]
     marker_offset: Vector = (0.0, 0.0, 0.0)  # body frame [m]
@@ -561,11 +558,12 @@ class SensingParams(BoundedFields):
 
 @dataclass(frozen=True)
 class RandomizationParams(BoundedFields):
-    """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
+    """Uniform distributions of episodes' initial states (the paper, Sec. III-C, "Domain
+    randomization").
 
     The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the
     mount in the direction ``Rz(yaw) Rx(roll) (-z)`` of the body frame, with the two angles' rates
-    on top of the body's."""
+    added to the body's."""
 
     spawn_height: float  # of the vehicle's centre of mass [m]
     position: NotNegativeVector  # +- [m]
@@ -575,12 +573,12 @@ class RandomizationParams(BoundedFields):
     mass: NotNegative  # +- fraction of the vehicle's mass
     cable_angle_deg: NotNegative  # +- roll of the cable [deg]
     cable_rate_deg: NotNegative  # +- rates of its roll and yaw [deg/s]
-    tether_variants: int  # number of cable lengths, one for each environment for good
+    tether_variants: int  # number of cable lengths; each environment keeps its length
     tether_spread: NotNegative  # the lengths span +- this fraction
     battery_used: NotNegative  # fraction of charge used is drawn from 0 to this
-    # goals are uniform on a ground disk of this radius about the spawn point [m]
+    # goals are uniform in a disk of this radius on the ground below the spawn point [m]
     goal_radius: float
-    # number of payload masses, and of drags, in every combination with the cable lengths
+    # number of payload masses and of drags, in every combination with the cable lengths
     payload_variants: int = 1
     payload_spread: NotNegative = 0.0  # the masses span +- this fraction
     drag_spread: NotNegative = 0.0  # the payload's drags span +- this fraction
