@@ -1,5 +1,6 @@
-"""A release once it is commanded: latched once, separated a known lag later; its landing is found
-in the payload's poses. `hil.control.tick.commander` judges and commands it.
+"""The release of the payload: latched once, followed by the separation after a known lag and by the
+landing, which is found in the payload's poses. `hil.control.tick.commander` decides on the release
+and commands it.
 """
 
 import math
@@ -12,8 +13,9 @@ from hil.errors import RunError
 from hil.poses.pose import Vector
 from visthrow.common.free_fall import GRAVITY, fall_time, free_flight
 
-LAG_TOLERANCE = 5e-3  # of the mechanism beyond the trained lag [s]
-# a payload that hangs this long after its separation is stuck, whatever the autopilot answered [s]
+LAG_TOLERANCE = 5e-3  # by which the mechanism's lag may exceed the trained one [s]
+# a payload that still hangs this long after its separation is stuck, even if the autopilot
+# acknowledged the release [s]
 STUCK_AFTER = 0.6
 ROUNDING = 1e-9  # tolerance of differences of times [s]
 GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
@@ -21,35 +23,37 @@ GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
 FALL_START = 0.02
 FEWEST_FALL_POSES = 5
 FALL_TIME = 0.12
-"""Free fall by which a separation is detected: from this long after the expected one [s], with so
-many poses at least, and for this long [s], in which drag takes a few millimetres.
+"""Free fall from which the separation is detected: its start after the expected separation [s], its
+least number of poses, and its duration [s], in which drag amounts to a few millimetres.
 """
 
 BEND = 5e-3
 BEND_TIME = 0.1
-"""Distance from the free fall, extended backwards, at which the rope still pulls [m], above the
-noise; poses up to this long before the expected separation are used [s].
+"""Distance from the free fall, extended backwards, that shows that the rope still pulls [m], above
+the noise of the poses; and the time before the expected separation from which poses are used [s].
 """
 
 BLUR = 0.03
-"""A rope that pulls so little that `BEND` takes longer than this hides the separation [s].
+"""If the rope pulls so little that the distance needs longer than this to reach `BEND`, the time of
+separation is not determined [s].
 
-The vision policy lets go at 2 to 6 m/s2; there the line ended up to 96 ms late.
+The vision policy releases at 2 to 6 m/s2; there the estimate was up to 96 ms late.
 """
 
-# last poses that a landing is extrapolated from: over 0.1 s free fall needs no drag
+# number of last poses from which a landing is extrapolated: over 0.1 s drag is negligible
 LANDING_POSES = 8
 
 POSE_TIMEOUT = 0.1
 MOST_EXTRAPOLATION = 0.15
-"""A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has
-landed where its fall leads: a gate that has missed those poses takes the impact for a jump.
+"""A payload without poses for this long [s], whose free fall reaches the ground no longer than that
+after the last pose [s], counts as landed where the fall ends: after a gap in the poses the gate
+rejects those after the impact as a jump.
 """
 
 
 @dataclass(frozen=True)
 class Landing:
-    """A throw as measured by the payload's poses; times on the runner's clock."""
+    """The landing of a throw, measured from the payload's poses; times on the runner's clock."""
 
     goal_w: Vector  # [m]
     start: float  # of the throw [s]
@@ -59,7 +63,7 @@ class Landing:
     error: float  # horizontal distance from the goal [m]
     duration: float  # from the throw's start to the landing [s]
     lag: float  # trained, from latch to separation [s]
-    separation: float | None  # by the poses [s]; None where they do not show it
+    separation: float | None  # from the poses [s]; None if they do not show it
     separation_w: Vector | None  # payload's centre at that time [m]
 
 
@@ -70,14 +74,14 @@ class PayloadFlight:
     goal_w: Vector  # [m]
     start: float  # of the throw [s]
     latch: float  # of the release [s]
-    height: float  # of the payload's centre as it lands [m]
+    height: float  # of the payload's centre at landing [m]
     lag: float  # from latch to separation [s]
     _times: list[float] = field(default_factory=list)
     _points: list[Vector] = field(default_factory=list)
 
     def add(self, time: float, pos: Vector) -> Landing | None:
-        """Take a pose of the payload, measured at a time [s], in our frames [m]; return the landing
-        once it is down.
+        """Add a position of the payload in the world frame [m], measured at a time [s]; return the
+        landing once it has landed.
         """
         self._times.append(time)
         self._points.append(pos)
@@ -91,8 +95,8 @@ class PayloadFlight:
         return self._find_landing()
 
     def overdue(self, time: float) -> Landing | None:
-        """Return the landing of a payload whose poses ended shortly before the ground, by a time
-        [s].
+        """Return the landing of a payload whose poses ended shortly before the ground; None if it
+        has not landed by a time [s].
         """
         times = self._times
         if len(times) < LANDING_POSES or times[-LANDING_POSES] <= self.latch + self.lag:
@@ -130,12 +134,12 @@ class PayloadFlight:
 
 
 def separation(times: ndarray, points: ndarray, expected: float) -> tuple[float, Vector] | None:
-    """Return the time [s] and place [m] of the separation: where the poses leave the free fall that
-    follows it, extended backwards.
+    """Return time [s] and position [m] of the separation: where the poses depart from the free fall
+    after it, extended backwards.
 
-    While the rope pulls, the path departs from the free fall by ``a (t_s - t)^2 / 2``; the root of
-    the distance is a line in time that ends at the separation. None with too few poses on either
-    side of the expected time [s], or too small a pull."""
+    While the rope pulls, the path departs from the free fall by ``a (t_s - t)^2 / 2``, so the
+    square root of the distance is linear in time and reaches 0 at the separation. Returns None with
+    too few poses before or after the expected time [s], or if the rope pulls too little."""
     begin = expected + FALL_START
     free = (times > begin) & (times < begin + FALL_TIME)
     if np.count_nonzero(free) < FEWEST_FALL_POSES:
@@ -162,14 +166,14 @@ def _parabola(times: ndarray, points: ndarray) -> tuple[ndarray, ndarray]:
 
 
 class Latch:
-    """The release of the payload, and whether it hangs by its own poses.
+    """The release of the payload, with a check by its poses of whether it still hangs.
 
     Attributes:
-        at: time of the release [s]; None before there is one in this throw.
-        command_time: of the mechanism's command [s].
+        at: time of the release [s]; None before the release of this throw.
+        command_time: when the mechanism is commanded [s].
         lag: trained, from latch to separation [s].
         count: releases so far.
-        stuck: payloads that stayed on.
+        stuck: released payloads that stayed attached.
         landings: of the throws so far.
     """
 
@@ -182,7 +186,7 @@ class Latch:
         height: float,
         command_delay: float = 0.0,
     ):
-        """Start with the payload hanging; raises `RunError` where the mechanism is slower than the
+        """Start with the payload attached. Raises `RunError`: the mechanism is slower than the
         policy was trained for.
 
         Args:
@@ -190,8 +194,8 @@ class Latch:
             mechanism_lag: of the mechanism, from its command to separation [s].
             hang: of the payload's centre below the vehicle's at rest [m].
             tolerance: within which the payload counts as hanging [m].
-            height: of the payload's centre as it lands [m].
-            command_delay: by which commands act later than in training [s].
+            height: of the payload's centre at landing [m].
+            command_delay: additional delay of commands compared with training [s].
         """
         if mechanism_lag > lag + command_delay + LAG_TOLERANCE:
             raise RunError(
@@ -210,7 +214,7 @@ class Latch:
         self._flight: PayloadFlight | None = None
 
     def rearm(self) -> None:
-        """Forget the last release: the payload hangs again, and the next throw is armed."""
+        """Forget the last release: the next throw is armed, with the payload attached again."""
         self.at = None
 
     def begin(self, time: float) -> None:
@@ -218,8 +222,8 @@ class Latch:
         self._start = time
 
     def trip(self, time: float, goal_w: Vector) -> float:
-        """Latch at a time [s]; return the time of the mechanism's command [s], from which it
-        separates after the trained lag.
+        """Latch the release at a time [s]; return when the mechanism must be commanded so that it
+        separates after the trained lag [s].
         """
         self.at, self.command_time = time, time + self._wait
         self.count += 1
@@ -232,7 +236,7 @@ class Latch:
 
     def payload_hangs(self, time: float, vehicle_w: Vector, payload_w: Vector | None) -> bool:
         """Return whether the payload hangs on the vehicle at a time [s], by the latch and by the
-        positions [m]; None for a payload without a fresh pose.
+        positions [m]; ``payload_w`` is None without a fresh pose of the payload.
         """
         if payload_w is None:
             return self.at is None
@@ -248,7 +252,7 @@ class Latch:
         return hangs
 
     def follow(self, time: float, payload_w: Vector) -> None:
-        """Take a pose of the payload, measured at a time [s], in our frames [m]."""
+        """Process a position of the payload in the world frame [m], measured at a time [s]."""
         if self._flight is not None:
             self._note_landing(self._flight.add(time, payload_w))
 

@@ -1,4 +1,4 @@
-"""The loop of a run."""
+"""The main loop of a run: poses in, one tick, recording."""
 
 import gc
 import math
@@ -23,25 +23,26 @@ from hil.poses.sources.pose_source import Source
 
 LEAD = 1e-3
 LEAD_SPREAD = 5e-3
-"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or
-two alone; earlier by a share of the second number that goes round from tick to tick, so that the
-link is looked at, and peers are asked for their time, at any point of their periods.
+"""Poses that have arrived are processed this long before the tick [s], so that only the last one or
+two are left to the tick. The second number is the range of an additional lead, which differs from
+tick to tick: so the link is read, and peers are asked for their time, at varying phases of their
+periods.
 """
 
 REHEARSAL = 5e-3
-"""Time kept for the first rehearsal [s]. Later ones keep the longest that recent ones took."""
+"""Time reserved for the first rehearsal [s]. Later, the longest recent rehearsal is reserved."""
 
-FORGETTING = 0.98  # by which the time that is kept shrinks from rehearsal to rehearsal
-MARGIN = 5e-4  # left between the rehearsal and the tick for poses that came meanwhile [s]
+FORGETTING = 0.98  # factor by which the reserved time shrinks from rehearsal to rehearsal
+MARGIN = 5e-4  # between rehearsal and tick, for poses that arrived meanwhile [s]
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
-SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in their numbers alone [s]
+SAY_AGAIN = 3.0  # least time between reports of one reason that differ only in numbers [s]
 
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
-# ticks between two looks of the garbage collector at all that was made since the start; the others
-# see the last tick's
+# ticks between collections of all garbage since the start; in other ticks only recent objects are
+# collected
 COLLECT_ALL = 50
 
 
@@ -49,14 +50,14 @@ class Operator(Protocol):
     """The source of the operator's commands."""
 
     def words(self, state: str) -> OperatorInput:
-        """Return the commands since the last tick in a ``state`` of the runner; never waits."""
+        """Return the commands since the last tick without waiting; ``state``: of the runner."""
 
 
 @dataclass
 class LandAfterCalibration:
-    """An operator who lands once the camera is calibrated, and never arms."""
+    """An operator that lands the vehicle once the camera is calibrated, and never arms a throw."""
 
-    operator: Operator  # whose other words count
+    operator: Operator  # whose other commands are passed on
     calibrating: Calibrating
 
     def words(self, state: str) -> OperatorInput:
@@ -67,27 +68,27 @@ class LandAfterCalibration:
 
 @dataclass
 class Loop:
-    """The turns of a run: wait for the tick, take poses in, tick, record."""
+    """The main loop: wait for the tick, process poses, decide and act, record."""
 
     runner: Runner  # with its back-end
     source: Source  # of poses
     clock: Clock  # of the ticks
     operator: Operator  # who arms
     recorder: RunRecorder | None = None  # of the run's folder
-    # called with the first decision of each state, and of each reason why it does not go on
+    # called with the first decision of each state and of each reason to wait
     tell: Callable[[TickRecord], None] | None = None
-    stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
-    eyes: Eyes | None = None  # a camera, where keypoints are a detector's
+    stages: Stages = field(default_factory=Stages)  # collects the times of each stage
+    eyes: Eyes | None = None  # the camera, if a detector finds the keypoints
     solver: CalibrationSolver | None = None  # of its calibration
     team: TeamLink | None = None  # to the runners of vehicles that throw with it
-    ours: int = 0  # ticks that were missed because one of ours took too long
+    ours: int = 0  # missed ticks, because a tick of the runner took too long
     count: int = 0
-    throws: list[float] = field(default_factory=list)  # times of the latches [s]
+    throws: list[float] = field(default_factory=list)  # times of the releases [s]
     _ended: float = -math.inf
-    _rehearsal: float = REHEARSAL  # time kept for one [s]
+    _rehearsal: float = REHEARSAL  # reserved for one [s]
     _state: str = ""
     _waits: str = ""
-    # reasons to wait, without their numbers, and when they were said [s]
+    # reasons to wait without their numbers -> when they were reported [s]
     _announced: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -95,12 +96,12 @@ class Loop:
         self.ticker = Ticker(self.clock, self.runner.pilot.period, grid)
 
     def fly(self, limit: float = math.inf) -> dict[str, Any]:
-        """Run until the state machine is done, the recorded poses have ended, or for a limit [s];
-        returns the summary.
+        """Run until the state machine is done, the recorded poses end, or a time limit [s] is over;
+        return the summary.
 
-        A vehicle that is ours is never left without a word: where the time is over in flight, or
-        something raises, the run is aborted and goes on until it has ended. A second Ctrl-C ends it
-        at once, after one more request to land."""
+        A vehicle under the runner's control is never abandoned: if the time is over in flight or an
+        exception is raised, the run is aborted and continues until it has ended. A second Ctrl-C
+        ends it at once, after one more request to land."""
         runner = self.runner
         clock = self.clock
         begin = self.clock.now()
@@ -120,7 +121,7 @@ class Loop:
         return self.summary()
 
     def turn(self, finished: bool) -> None:
-        """Do one tick; ``finished``: the run's time is over, and what flies is to come down."""
+        """Do one tick; ``finished``: the run's time is over, so a flying vehicle has to land."""
         runner = self.runner
         source = self.source
         clock = self.clock
@@ -179,7 +180,7 @@ class Loop:
         self._ended = clock.now()
 
     def _take_poses(self) -> list[Pose]:
-        """Take in the poses that have come before their tick."""
+        """Process the poses that have arrived before the tick, and return them."""
         poses = self.source.poll(self.clock.now())
         self.runner.take_poses(poses)
         return poses
@@ -187,8 +188,8 @@ class Loop:
     def _rehearse(self) -> None:
         """Rehearse the next tick just before it is due, if there is time for it.
 
-        The flight's clock measures the time: it stands still in lock step, where ticks must not
-        depend on how fast the computer is.
+        Time is measured by the run's clock. In lock step this clock stands still, so that ticks do
+        not depend on the computer's speed.
         """
         clock = self.clock
         due = self.ticker.due()
@@ -200,7 +201,9 @@ class Loop:
         self._rehearsal = max(clock.now() - start, FORGETTING * self._rehearsal)
 
     def _tick(self, time: float, *inputs: Any) -> TickRecord:
-        """Decide one tick by what the team agreed on; tell it what this vehicle is ready for."""
+        """Do one tick with what the team agreed on, and tell the team what this vehicle is ready
+        for.
+        """
         if self.team is None:
             return self.runner.tick(time, *inputs)
         self.runner.agreed = self.team.agree(time)
@@ -209,8 +212,8 @@ class Loop:
         return decision
 
     def _tell(self, decision: TickRecord) -> None:
-        """Say a change of state and a new reason to wait at once, and one that differs in its
-        numbers alone every few seconds.
+        """Report a change of state or a new reason to wait at once; a reason of which only the
+        numbers changed, every few seconds.
         """
         waits = decision.waits
         time = decision.time
@@ -232,8 +235,8 @@ class Loop:
             self.tell(decision)
 
     def summary(self) -> dict[str, Any]:
-        """Return the runner's summary with ticks, misses (all, and ours: of a tick that took too
-        long), and each stage's times.
+        """Return the runner's summary with the ticks, the missed ticks (all of them, and those
+        missed because a tick took too long), and the times of each stage.
         """
         runner = self.runner
         backend = self.runner.backend
@@ -255,7 +258,7 @@ class Loop:
 
 
 def _wait(clock: Clock, until: float, backend: Backend, source: Source) -> None:
-    """Wait until a time [s]; in between do what the back-end has to do at a time of its own."""
+    """Wait until a time [s]; meanwhile serve the back-end whenever it is due."""
     while True:
         due = backend.due()
         if due is None or due >= until:

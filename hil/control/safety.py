@@ -1,4 +1,4 @@
-"""Output guard, geofences and pre-throw checks between a decision and the vehicle."""
+"""Output guard, geofences and pre-throw checks."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from visthrow.config.bounds import Bounded, NotNegative, Positive
 class GuardParams(Bounded):
     """Limits on the change of a command from one tick to the next.
 
-    Its bounds are those of the policy's training.
+    The limits of the commands themselves are those of the policy's training.
     """
 
     slew_thrust: Positive  # [N]
@@ -23,8 +23,8 @@ class GuardParams(Bounded):
 
 
 class Guard:
-    """Clips and slew-limits commands, and refuses those that are not finite; counts what it
-    clipped, slewed and refused.
+    """A filter that clips and slew-limits commands and refuses those that are not finite;
+    ``clipped``, ``slewed`` and ``refused`` count them.
     """
 
     def __init__(self, params: GuardParams, max_thrust: float, max_rate: Vector):
@@ -37,11 +37,11 @@ class Guard:
         self.clipped = self.slewed = self.refused = 0
 
     def reset(self) -> None:
-        """Forget the last command: after a silence the vehicle's state is unknown."""
+        """Forget the last command: after a pause in the commands it limits nothing."""
         self._last = None
 
     def check(self, command: Command) -> Command | None:
-        """Return the command that may be sent, [N, rad/s], or None where it is not finite."""
+        """Return the limited command [N, rad/s]; None if the command is not finite."""
         if len(command) != 4 or not all(map(math.isfinite, command)):
             self.refused += 1
             return None
@@ -62,13 +62,15 @@ class Guard:
 
 @dataclass(frozen=True)
 class FenceParams(Bounded):
-    """Boxes in our world that vehicle and payload may not leave; the goal is in the payload's."""
+    """Boxes in the world frame that vehicle and payload must not leave; the payload's contains the
+    goal.
+    """
 
     vehicle_low: Vector  # [m]
     vehicle_high: Vector  # [m]
     payload_low: Vector  # [m]
     payload_high: Vector  # [m]
-    deceleration: Positive  # that the vehicle brakes with [m/s^2]
+    deceleration: Positive  # of the braking vehicle [m/s^2]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -92,8 +94,8 @@ def box_violation(point: Vector, low: Vector, high: Vector) -> str | None:
 def fence_violation(
     params: FenceParams, vehicle: BodyState, payload: BodyState | None
 ) -> str | None:
-    """Return which fence is violated, or will be at the end of braking, or None; the payload is
-    None where it flies freely.
+    """Return which fence is violated, or would be at the end of braking; None if neither.
+    ``payload`` is None while it flies freely.
     """
     stop = tuple(
         x + v * abs(v) / (2.0 * params.deceleration) for x, v in zip(vehicle.pos, vehicle.vel)
@@ -111,17 +113,19 @@ def fence_violation(
 
 @dataclass(frozen=True)
 class CheckParams(Bounded):
-    """Limits of the pre-throw checks; each catches a mistake that no single pose shows."""
+    """Limits of the pre-throw checks. Each check finds a mistake that no single pose reveals."""
 
-    tilt_deg: Positive  # of the vehicle: a wrong quaternion order stands it on its head
-    # that the vehicle is put up with: 90 or 180 deg off, an axis or a quaternion is exchanged
+    tilt_deg: Positive  # of the vehicle: a wrong quaternion order shows it upside down
+    # of the vehicle when it is set up: an error of 90 or 180 deg means exchanged axes or a wrong
+    # quaternion order
     heading_deg: float
     heading_tolerance_deg: Positive
-    # between payload and vehicle against the rope's length [m]: bodies exchanged, marker lost
+    # of the payload's distance from where it should hang [m]: bodies exchanged, marker lost
     rope_tolerance: Positive
     home_radius: Positive  # of the vehicle from its hover point [m]
     speed: Positive  # of the vehicle, noise included [m/s]
-    # body rates of a doublet in the first hover, by which signs are seen [rad/s]; 0: none
+    # body rates of the doublets in the first hover that reveal the signs of the axes [rad/s]; 0:
+    # none
     probe: NotNegative = 0.0
 
 
@@ -134,7 +138,7 @@ def failed_checks(
     home_w: Vector,
     hang: float,
 ) -> list[str]:
-    """Return the failed pre-throw checks, in words; ``hang`` is the payload's distance below the
+    """Return texts of the failed pre-throw checks; ``hang`` is the payload's distance below the
     vehicle at rest [m].
     """
     failed = []

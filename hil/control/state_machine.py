@@ -1,5 +1,5 @@
-"""State machine of a run: its reaction to the operator, stale poses, fences, time-outs and a silent
-autopilot. Pure logic.
+"""State machine of a run: the reaction to the operator, stale poses, fences, time-outs and a silent
+autopilot. It has no side effects.
 
     idle -> check -> ready -> armed -> throw -> recover -> ready (more throws) or land -> done
     any -> abort -> done
@@ -62,22 +62,22 @@ class Inputs:
     failed_checks: tuple[str, ...] = ()
     fence: str | None = None  # which fence is violated
     calm: bool = False  # vehicle at home, vehicle and payload slow
-    separated: bool = False  # the trained lag after the latch is over in this throw
+    separated: bool = False  # in this throw the trained lag since the latch is over
     released: bool = False  # the latch has tripped in this throw
-    lost: bool = False  # the payload has come off by itself
-    astray: bool = False  # releases were refused, and no better one came in time
+    lost: bool = False  # the payload has detached without a release
+    astray: bool = False  # releases were refused, and none was accepted in time
     agreed: int | None = None  # what the team agreed on for this tick; None without a team
-    alone: bool = False  # the team has agreed on nothing for a while
+    alone: bool = False  # the team has not agreed on anything for a while
     grounded: bool = False  # the vehicle has landed
-    failure: str | None = None  # of policy, guard, release or of the runner itself
+    failure: str | None = None  # of policy, guard, release or runner
     arm: bool = False  # the operator's commands
     land: bool = False
     abort: bool = False
     recording: bool = True  # everything was recorded so far
     following: bool = True  # the autopilot follows commands
-    note: str = ""  # of the autopilot: a problem, or what it waits for
+    note: str = ""  # of the autopilot: its problem, or what it waits for
     why: str = ""  # reason of an abort that the operator did not type
-    streams: tuple[str, ...] = ()  # problems of the pose streams, before the take-over
+    streams: tuple[str, ...] = ()  # problems of the pose streams before the take-over
     disagrees: str | None = None  # how the first hover contradicts the policy's vehicle
 
     def list_missing(self) -> list[str]:
@@ -102,9 +102,9 @@ class Machine:
 
     params: StateParams  # time-outs and durations
     max_throws: int  # after which it lands
-    patient: bool = False  # idle and check have no time-out, as where poses are only observed
-    # whether commands go to a vehicle. Without, no fence applies before a throw is armed: others
-    # fly.
+    patient: bool = False  # whether idle and check have no time-out: poses are only observed
+    # whether commands go to a vehicle. If not, no fence applies before a throw is armed, because
+    # somebody else flies.
     sends: bool = True
     state: State = State.IDLE  # of this tick
     reason: str = "start"  # of the last change
@@ -113,11 +113,11 @@ class Machine:
     cancelled: int = 0  # throws that ended without a release
     flown: bool = False  # whether this run has ever commanded the vehicle
     aborted: bool = False  # whether an abort ended the run
-    # how the vehicle left its fence after a throw, which ends the run by a landing without an abort
+    # how the vehicle left its fence after a throw; the run then ends by a landing, not by an abort
     left_fence: str | None = None
-    handed_back: bool = False  # whether the autopilot's own hold, or the pilot, has it again
-    ready_to_throw: bool = False  # whether nothing but the team's word is missing
-    _lasting_since: float | None = None  # of the condition that must last [s]
+    handed_back: bool = False  # whether the autopilot's hold mode or the pilot has control again
+    ready_to_throw: bool = False  # whether only the team's agreement is missing
+    _lasting_since: float | None = None  # start of the condition that must last [s]
 
     def step(self, time: float, inputs: Inputs) -> State:
         """Advance by one tick; return the state to act in."""
@@ -125,7 +125,7 @@ class Machine:
             self.since = time
         urgent = self._abort_reason(inputs)
         if self.state is State.ABORT:
-            # A vehicle that was never ours needs no descent.
+            # A vehicle that the runner never commanded needs no descent.
             if not self.flown or time - self.since > self.params.abort:
                 self._go(time, State.DONE, self.reason)
         elif self.state is not State.DONE:
@@ -172,7 +172,7 @@ class Machine:
         self._go(time, State.LAND, "the operator said land" if inputs.land else reason)
 
     def waits(self, inputs: Inputs) -> str:
-        """Return what the state waits for, in words; empty where it waits for time alone."""
+        """Return a text on what the state waits for; empty if it only waits for time to pass."""
         texts: list[str] = []
         if self.state in (State.IDLE, State.CHECK):
             texts += [*inputs.list_missing(), *inputs.streams]
@@ -204,7 +204,7 @@ class Machine:
         return time - self._lasting_since >= duration - 1e-9
 
     def measure_hold(self, time: float) -> float:
-        """Return for how long the condition that must last has held [s]."""
+        """Return how long the condition that must last has held [s]."""
         return 0.0 if self._lasting_since is None else time - self._lasting_since
 
     def _is_late(self, time: float) -> bool:
@@ -269,7 +269,7 @@ class Machine:
         if inputs.fence is not None:  # the payload is off and the vehicle brakes: no more throws
             self.left_fence = inputs.fence
             self._go(time, State.LAND, f"after the throw, fence: {inputs.fence}")
-        # A stale pose never moves: that says nothing about the vehicle.
+        # A stale pose does not move, even if the vehicle does.
         elif self._has_lasted(time, inputs.calm and inputs.vehicle < HOLD, self.params.quiet):
             state = State.READY if self.throws < self.max_throws else State.LAND
             self._go(time, state, "hovering again")
@@ -290,7 +290,9 @@ _STEPS = {
     State.RECOVER: Machine._recover,
     State.LAND: Machine._land,
 }
-"""Step of each state. Names assembled at each tick would fill Python's attribute cache."""
+"""Step function of each state. Method names assembled at each tick would fill Python's attribute
+cache.
+"""
 
 
 @dataclass(frozen=True)
@@ -300,7 +302,7 @@ class OperatorInput:
     arm: bool = False
     land: bool = False
     abort: bool = False
-    why: str = ""  # reason of an abort that was not typed: a signal, the end of the run's time
+    why: str = ""  # reason of an abort by a signal or by the end of the run's time
 
 
 @dataclass
@@ -318,9 +320,9 @@ class TickRecord:
     release: bool = False  # the policy's release was executed
     note: str = ""
     waits: str = ""  # what the state waits for
-    ready: int = 0  # for what, as the team receives it; see `hil.links.team_link`
-    agreed: int | None = None  # by the team for this tick; None without a team
-    # in a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
+    ready: int = 0  # what the vehicle is ready for, as sent to the team; see `hil.links.team_link`
+    agreed: int | None = None  # what the team agreed on for this tick; None without a team
+    # from the camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     detection: list | None = None
-    # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
+    # result that arrived with this tick, or why there is none; see `visthrow.onboard.calibration`
     calibration: dict | str | None = None
