@@ -1,4 +1,4 @@
-"""Predicts the landing of a payload that is released now, and refuses a release that would miss.
+"""Prediction of the landing if the payload is released now; a release that would miss is refused.
 
 The prediction is coarse: until separation the payload keeps its velocity, then it flies freely. For
 good throws of the shipped policies at 2 m it is off by 0.05 to 0.20 m. It distinguishes a throw
@@ -14,8 +14,8 @@ from visthrow.common.rotations import plus
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.hover import GRAVITY
 
-TIME_STEP = 0.01  # step of the free flight's midpoint rule [s]: exact without drag
-LONGEST = 3.0  # flight that is predicted at most [s]
+TIME_STEP = 0.01  # step of the midpoint rule [s], which is exact without drag
+LONGEST = 3.0  # longest flight that is predicted [s]
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,15 @@ class AimParams(Bounded):
 
 
 class ReleaseCheck:
-    """Judges the releases that a policy asks for; ``refused`` counts the refusals of this run."""
+    """A check of releases that a policy requests; ``refused`` counts the refusals of this run."""
 
     def __init__(self, params: AimParams | None, delay: float, height: float, rope: dict[str, Any]):
         """Take what the policy was trained with.
 
         Args:
-            params: None refuses nothing.
+            params: limits of the check; None refuses no release.
             delay: from the time of a state to the separation, if the latch trips now [s].
-            height: of the payload's centre as it lands [m].
+            height: of the payload's centre at landing [m].
             rope: of the policy's contract, with mass and drag of the payload.
         """
         self._params = params
@@ -52,7 +52,9 @@ class ReleaseCheck:
         self._first = None
 
     def predict_landing(self, payload: BodyState) -> tuple[float, float]:
-        """Return where a payload in this state lands if the latch trips now [m], world frame."""
+        """Return x and y of the landing of a payload in this state if it is released now [m], world
+        frame.
+        """
         vel = payload.vel
         pos = plus(payload.pos, vel, self._delay)
         time = 0.0
@@ -88,5 +90,5 @@ class ReleaseCheck:
         )
 
     def has_given_up(self, time: float) -> bool:
-        """Return whether the patience is over at a time [s] since the first refused release."""
+        """Return whether the patience since the first refused release is over at a time [s]."""
         return self._first is not None and time - self._first >= self._params.patience

@@ -1,8 +1,9 @@
-"""Hover calibration in a run: camera and thrust are estimated from a still hover and a small sway.
+"""Calibration of camera and thrust in a run, from a still hover and a small sway.
 
 The runner hovers, sways and records; another process estimates (`CalibrationSolver`), so that no
-tick waits. The result is recorded with the tick that it arrives in, so that a replay repeats it. A
-throw waits for the result, and is refused where it is uncertain or outside the training's range."""
+tick waits. The result is recorded with the tick in which it arrives, so that a replay repeats it. A
+throw waits for the result, and is refused if the result is uncertain or outside the range of the
+training."""
 
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -28,18 +29,18 @@ class CalibrationParams(Bounded):
     sway: Positive = calibration.SWAY  # [s]
     rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
     frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]
-    # of the camera, which is corrected; beyond it the field of view differs too much
+    # of the camera, which is corrected; beyond this tilt the field of view differs too much
     most_tilt_deg: Positive = 10.0
     most_scale: Positive = 0.06  # error of the focal length, which is corrected [-]
     most_latency: Positive = 0.06  # of the keypoints, which is compensated [s]
-    thrust: Positive = 0.1  # relative error: twice the spread of masses in training
-    sure_tilt_deg: Positive = 0.5  # standard deviation at most
+    thrust: Positive = 0.1  # relative error; twice the spread of the mass in training
+    sure_tilt_deg: Positive = 0.5  # largest standard deviation
     sure_latency: Positive = 0.005  # likewise [s]
     spreads: Spreads = field(default_factory=Spreads)  # of poses and keypoints
 
 
 class CalibrationSolver:
-    """Estimates calibrations in a process of its own, which starts before the flight."""
+    """Estimates calibrations in a separate process, which starts before the flight."""
 
     def __init__(self, camera: CameraParams, contract: dict[str, Any], spreads: Spreads):
         """Start the process; arguments as of `visthrow.onboard.calibration.try_calibration`."""
@@ -49,11 +50,13 @@ class CalibrationSolver:
         self._result: Future | None = None
 
     def submit(self, hovered: Hovered) -> None:
-        """Begin to estimate; `poll` returns the result."""
+        """Start an estimation; `poll` returns its result."""
         self._result = self._pool.submit(calibration.try_calibration, hovered, *self._conditions)
 
     def poll(self) -> Calibration | str | None:
-        """Return a new result, or why there is none, once; None while there is nothing new."""
+        """Return a new result once, or why the estimation failed; None while there is no new
+        result.
+        """
         if self._result is None or not self._result.done():
             return None
         result = self._result
@@ -67,13 +70,13 @@ class CalibrationSolver:
 
 
 def _warm() -> None:
-    """Load this module, and with it what a calibration needs; compute on one core."""
+    """Load the modules that a calibration needs, in the worker; use one core."""
     torch.set_num_threads(1)
 
 
 @dataclass
 class Calibrating:
-    """The hover and the sway of a run, from the first calm hover on."""
+    """The still hover and sway of a calibration, from the first calm hover on."""
 
     params: CalibrationParams
     calibration: Calibration | None = None  # the result; None before it
@@ -84,8 +87,8 @@ class Calibrating:
     _solving: bool = False
 
     def rates(self, time: float, calm: bool, goal_w: Vector) -> tuple[float, float]:
-        """Return roll and pitch rate to add to the hover's at a time [rad/s]; ``calm``: the vehicle
-        hovers and nothing swings; ``goal_w``: the goal's position [m].
+        """Return the roll and pitch rate to add to the hover's at a time [rad/s]; ``calm``: whether
+        the vehicle hovers without swing; ``goal_w``: position of the goal [m].
         """
         p = self.params
         if self.calibration is not None or self._solving:
@@ -109,16 +112,18 @@ class Calibrating:
         valid: np.ndarray,
         age: float,
     ) -> None:
-        """Record a tick: the vehicle by its poses, the commanded thrust [N], normalised keypoints
-        of a new frame, shape (8, 2), their validity, shape (8,), and the age of the frame's stamp
-        beyond that of the poses [s].
+        """Record a tick: the vehicle's state by its poses, the commanded thrust [N], the normalised
+        keypoints of a new frame, shape (8, 2), their validity, shape (8,), and by how much the
+        frame is older than the poses [s].
         """
         if self._begin is not None and not self._solving and self.calibration is None:
             state = (vehicle.pos, vehicle.quat, vehicle.vel, vehicle.rate)
             self._rows.append((time, *state, thrust, points, valid, age))
 
     def stop(self) -> None:
-        """Start again with the next calm hover: the vehicle was not ours."""
+        """Discard the recording, because the vehicle did not follow; start again with the next calm
+        hover.
+        """
         if self.calibration is None and not self._solving:
             self._begin = None
             self._rows = []
@@ -135,13 +140,13 @@ class Calibrating:
         self._solving = True
 
     def due(self) -> Hovered | None:
-        """Return a hover to estimate from, once."""
+        """Return a complete recording once, to be passed to the solver; else None."""
         due = self._due
         self._due = None
         return due
 
     def take(self, result: Calibration | str) -> None:
-        """Take a solver's result; without one, hover and sway are repeated."""
+        """Store the solver's result; if it failed, hover and sway are repeated."""
         self._solving = False
         if isinstance(result, Calibration):
             self.calibration = result
@@ -149,7 +154,7 @@ class Calibrating:
             self._problem = result
 
     def problems(self) -> list[str]:
-        """Return why a throw has to wait, or is refused."""
+        """Return the reasons why a throw has to wait or is refused."""
         p = self.params
         estimate = self.calibration
         if estimate is None:

@@ -1,9 +1,8 @@
-"""What a system can be asked for, so that ticks come in time: a real-time priority, and memory that
-stays in memory.
+"""Real-time priority and locked memory, so that ticks are on time.
 
 Both need rights: ``setcap cap_sys_nice,cap_ipc_lock+ep`` on the interpreter, or ``rtprio`` and
-``memlock`` in ``/etc/security/limits.conf``. What is not granted is said, and the run goes on
-without it."""
+``memlock`` in ``/etc/security/limits.conf``. If the system refuses one of them, the run reports it
+and continues without."""
 
 import ctypes
 import gc
@@ -16,7 +15,7 @@ from typing import Annotated
 
 from visthrow.config.bounds import Bound, Bounded
 
-# after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
+# interval after which Python switches threads [s]; its default, 5 ms, is a quarter of a tick
 SWITCH = 5e-4
 # flags of mlockall(2)
 LOCK_CURRENT = 1
@@ -27,13 +26,15 @@ LOCK_FUTURE = 2
 class RealtimeParams(Bounded):
     """Parameters of the real-time scheduling."""
 
-    priority: Annotated[int, Bound(0, 99)] = 0  # of SCHED_FIFO, 1 to 99; 0: as any process
-    lock_memory: bool = False  # no page of the process leaves the memory
+    priority: Annotated[int, Bound(0, 99)] = 0  # of SCHED_FIFO, 1 to 99; 0: no real-time priority
+    lock_memory: bool = False  # whether all pages of the process stay in memory
 
 
 @contextmanager
 def pause_garbage_collection() -> Iterator[None]:
-    """Leave all that exists by now out of garbage collection, which is then ours to call."""
+    """Exclude all present objects from garbage collection and disable automatic collections; the
+    caller collects.
+    """
     was = gc.isenabled()
     gc.freeze()
     gc.disable()
@@ -46,11 +47,11 @@ def pause_garbage_collection() -> Iterator[None]:
 
 
 def prepare(params: RealtimeParams) -> list[str]:
-    """Ask for what is wanted, for this thread and those that it starts from now on; returns what
-    was refused, and why.
+    """Request priority and locked memory for this thread and those that it starts later; return
+    texts of what was refused, and why.
 
-    The network runs on one thread, more only wait for each other; the recorder's gives way to the
-    flying one soon."""
+    The network runs on one thread, because more would wait for each other. Threads switch often, so
+    that the recorder's thread soon yields to the control loop."""
     import torch
 
     torch.set_num_threads(1)
@@ -69,8 +70,8 @@ def prepare(params: RealtimeParams) -> list[str]:
 
 
 def keep(params: RealtimeParams) -> list[str]:
-    """Keep the priority from threads and processes that are started from now on; returns as
-    :func:`prepare`.
+    """Prevent threads and processes that are started later from inheriting the priority; return as
+    :func:`prepare` does.
     """
     return _schedule(params.priority, os.SCHED_RESET_ON_FORK) if params.priority else []
 
@@ -78,6 +79,6 @@ def keep(params: RealtimeParams) -> list[str]:
 def _schedule(priority: int, flag: int) -> list[str]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | flag, os.sched_param(priority))
-    except (OSError, AttributeError) as error:  # no right to, or no such call on this system
+    except (OSError, AttributeError) as error:  # no permission, or no such call on this system
         return [f"no real-time priority: {error}"]
     return []

@@ -1,13 +1,13 @@
-"""Compares a vehicle's response in its first hover with the commands.
+"""Comparison of the vehicle's response in the first hover with its commands.
 
-It recognises another weight, another thrust line or a reversed rate before the vehicle has sunk. A
-doublet of all three body rates makes the vehicle turn, so that signs show in a calm hover. An
-autopilot that reports its body rates is judged by them within a tenth of a second, against how they
-wander in its own hover. Poses alone do not suffice for that: in this time the vehicle turns by less
-than they scatter. By poses a doublet is judged once it was answered, by the angle turned.
+It detects a wrong weight, a wrong thrust calibration or a reversed rate before the vehicle has
+sunk. Doublets of all three body rates turn the vehicle, so that the signs show in a calm hover. If
+the autopilot reports its body rates, they are judged within a tenth of a second, relative to their
+noise in the autopilot's own hover. Poses cannot do that: in this time the vehicle turns by less
+than their noise. From poses a doublet is judged after its response, by the angle turned.
 
-An axis may be slower than the training's: it is judged by the time constant that explains its
-answer best, and doublets grow longer until it is known."""
+An axis may be slower than in training: it is judged with the time constant that explains its
+response best, and the doublets become longer until its sign is known."""
 
 import math
 from collections import deque
@@ -21,42 +21,47 @@ from visthrow.common.rotations import Vector, conjugate, multiply, rotate_one, r
 from visthrow.onboard.hover import GRAVITY
 
 AXES = ("roll", "pitch", "yaw")
-STROKES = (0.16, 0.32, 0.64)  # of the doublets, one way, then the other [s]
-LAGS = (0.05, 0.15, 0.45)  # time constants of an answer to a command that are tried [s]
+STROKES = (
+    0.16,
+    0.32,
+    0.64,
+)  # duration of either half of each doublet [s]
+LAGS = (0.05, 0.15, 0.45)  # time constants of the response that are tried [s]
 DEADS = 6
-"""Dead times before an answer that are tried, in ticks: real autopilots are half way after 25 to
-100 ms. Of each sign of an axis the pair of time constant and dead time counts that explains most.
+"""Number of dead times that are tried, one tick apart: real autopilots reach half of the response
+after 25 to 100 ms. For each sign of an axis, the pair of time constant and dead time counts that
+explains the response best.
 """
-# least change of a reported rate from tick to tick that no command explains [rad/s]
+# smallest noise assumed for the change of a reported rate between ticks [rad/s]
 RATE_NOISE = 0.02
-GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
-HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
-FEWEST_RATES = 4  # reported changes that a sign is taken from
-FALL = 0.4  # time over which the thrust is judged [s]
+GAINS = np.array([0.3, 1.5])  # range for an axis that turns as commanded
+HOVERED = 50  # ticks of the autopilot's own hover from which that noise is measured
+FEWEST_RATES = 4  # reported changes that a sign needs
+FALL = 0.4  # duration over which the thrust is judged [s]
 FALL_DEAD = 2  # dead time of the thrust, in ticks
 ANGLE_NOISE = 0.006  # of an attitude between poses [rad]
 HEIGHT_NOISE = 0.002  # of a height between poses [m]
-CERTAIN = 4.0  # deviations of the noise beyond which something is known
-CERTAIN_SIGN = 5.0  # likewise beyond which a sign is known
-FEWEST_HEIGHTS = 5  # heights that a vertical acceleration is taken from
+CERTAIN = 4.0  # standard deviations of the noise beyond which an error is certain
+CERTAIN_SIGN = 5.0  # likewise for a sign
+FEWEST_HEIGHTS = 5  # heights that a vertical acceleration needs
 
 
 class Response:
-    """Judges the first hover that is ours.
+    """Judges the first hover under the runner's commands.
 
     Attributes:
-        problem: what does not agree, in words; None so far.
-        reported: changes of its rates that the autopilot has reported.
-        time: that the vehicle has been ours and judged [s].
+        problem: text on the disagreement found; None so far.
+        reported: number of changes of the reported rates.
+        time: for which the vehicle has followed the runner's commands and been judged [s].
     """
 
     def __init__(self, period: float, mass: float, tolerance: float, probe: float):
-        """Wait for the first tick.
+        """Start before the first tick.
 
         Args:
             period: between two ticks [s]. mass: of vehicle, rope and payload [kg].
-            tolerance: of the thrust, relative. probe: rate of the doublets [rad/s]; 0: none, and
-                signs are judged by what the hover happens to command.
+            tolerance: of the thrust, relative. probe: rate of the doublets [rad/s]; 0: no doublets,
+                and signs are judged by the commands of the hover alone.
         """
         self._period = period
         self._probe = probe
@@ -66,9 +71,9 @@ class Response:
         self._ticks = 0
         strokes = [round(stroke / period) for stroke in STROKES]
         self._signs = [sign for count in strokes for sign in [1] * count + [-1] * count]
-        self._ends = 2 * np.cumsum(strokes) + DEADS  # ticks at which a doublet was answered
+        self._ends = 2 * np.cumsum(strokes) + DEADS  # ticks at which a response is complete
         hover = np.array([mass * GRAVITY, 0.0, 0.0, 0.0])
-        self._commands = deque([hover] * DEADS, maxlen=DEADS)  # the newest first
+        self._commands = deque([hover] * DEADS, maxlen=DEADS)  # newest first
         # expected now, by time constant and dead time [N, rad/s]
         self._responses = np.tile(hover, (len(LAGS), DEADS, 1))
         self._shares = 1.0 - np.exp(-period / np.array(LAGS))[:, None, None]
@@ -76,13 +81,13 @@ class Response:
         self._speed = self._height = 0.0  # expected from the commands, upwards [m/s], [m]
         self._heights: list[float] = []  # above the expected ones [m]
         tried = (len(LAGS), DEADS, 3)
-        # of changes of rates that were reported and those that commands lead to, and of turned
-        # angles likewise: their product, the squares
+        # sums over reported and commanded changes of rates: their product, the squares of either;
+        # likewise over angles turned
         self._sums = np.full((3, *tried), 1e-9)
         self._angle_sums = np.zeros((3, *tried))
-        self._drift_sums = np.zeros((2, *tried))  # of ticks with commanded and turned angles
+        self._drift_sums = np.zeros((2, *tried))  # sums of tick times angle: commanded, turned
         self._angle = np.zeros(3)  # turned since the first tick, by poses [rad]
-        self._commanded_angles = np.zeros(tried)  # that commands lead to [rad]
+        self._commanded_angles = np.zeros(tried)  # [rad]
         self._before = deque(maxlen=HOVERED)  # reported rates of the autopilot's own hover
         self._reported: ndarray | None = None
         self.reported = 0
@@ -98,7 +103,7 @@ class Response:
         return self._probe > 0.0 and self.problem is None and not self._confirmed.all()
 
     def rates(self) -> Vector:
-        """Return the doublet's body rates of this tick [rad/s]; of axes that are known, none."""
+        """Return the doublet's body rates in this tick [rad/s]; 0 for axes whose sign is known."""
         if not self.running or self._ticks >= len(self._signs):
             return (0.0, 0.0, 0.0)
         stroke = self._probe * self._signs[self._ticks]
@@ -110,7 +115,7 @@ class Response:
         vehicle: BodyState,
         rates: tuple[float, ...] | None = None,
     ) -> None:
-        """Note the command of a tick, thrust [N] and body rates [rad/s], where the vehicle is at
+        """Record the command of a tick, thrust [N] and body rates [rad/s], the vehicle's state at
         that tick, and the body rates that the autopilot last reported [rad/s].
         """
         if self._confirmed.all() and self._ticks * self._period > FALL:
@@ -126,7 +131,7 @@ class Response:
         self._responses = self._responses + change
 
     def pause(self, rates: tuple[float, ...] | None) -> None:
-        """Note a tick in which nothing of ours was followed, and the rates reported then."""
+        """Record a tick in which the vehicle did not follow the runner, with its reported rates."""
         self._last = None
         if rates is not None and not self._ticks:
             self._before.append(rates)
@@ -140,7 +145,7 @@ class Response:
         self._heights.append(vehicle.pos[2] - self._height)
         if len(self._heights) < FEWEST_HEIGHTS:
             return
-        # place and speed at the beginning are as unknown as the acceleration that is looked for
+        # initial height and speed are unknown too, so a parabola is fitted
         terms = np.vander(self._period * np.arange(len(self._heights)), 3)
         inverse = np.linalg.inv(terms.T @ terms)
         wrong = 2.0 * float((inverse @ terms.T @ np.array(self._heights))[0])
@@ -153,8 +158,8 @@ class Response:
             )
 
     def _judge_rates(self, rates: tuple[float, ...] | None) -> None:
-        """Judge by reported rates: by how each goes on from the last one, so that what the vehicle
-        did before it was ours does not count.
+        """Judge the change of the reported rates from tick to tick, so that motion from before the
+        take-over does not count.
         """
         last = self._reported
         self._reported = None if rates is None else np.array(rates)
@@ -169,15 +174,15 @@ class Response:
         self._judge(_scores(self._sums, self._measure_wandering(), self.reported))
 
     def _measure_wandering(self) -> ndarray:
-        """Return the variance of a reported rate from tick to tick in the autopilot's own hover
-        [rad^2/s^2], shape (3,).
+        """Return the variance of the reported rates' change from tick to tick in the autopilot's
+        own hover [rad^2/s^2], shape (3,).
         """
         changes = np.diff(np.array(self._before), axis=0) if len(self._before) > 1 else np.zeros(3)
         return np.maximum((changes**2).mean(axis=0), RATE_NOISE**2)
 
     def _judge_turns(self, vehicle: BodyState) -> None:
-        """Judge by poses, whenever all of a doublet was answered: by the angle turned since the
-        first tick. A doublet turns to one side and back, whatever its delay.
+        """Judge the angle turned since the first tick, by poses, whenever the response to a doublet
+        is complete. A doublet turns the vehicle to one side and back, whatever the delay.
         """
         turn = multiply(conjugate(self._last.quat), vehicle.quat)
         self._angle = self._angle + rotation_vector(turn)
@@ -189,7 +194,7 @@ class Response:
         self._drift_sums += [tick * commanded, tick * angle]
         if self._ticks not in self._ends:
             return
-        # a steady drift of either angle explains nothing: take its part out of the sums
+        # remove a linear drift of either angle from the sums
         commanded_drift, turned_drift = self._drift_sums
         products = [commanded_drift * turned_drift, commanded_drift**2, turned_drift**2]
         drift = np.array(products) / sum(k * k for k in range(1, self._ticks + 1))
@@ -209,18 +214,17 @@ class Response:
 
 
 def _scores(sums: ndarray, variance: ndarray, count: int) -> ndarray:
-    """Return how much better the commanded sign explains each axis than the reverse or no turn
-    does, in deviations, shape (3,); negative where the reverse explains it best.
+    """Return by how many standard deviations the commanded sign explains each axis better than the
+    reversed sign or no rotation, shape (3,); negative if the reversed sign explains it best.
 
     Args:
-        sums: over what was measured and what commands lead to, of their product, of the commanded
-            squares, of the measured squares, for each time constant, dead time and axis, shape
-            (3, lags, dead times, 3).
-        variance: of the noise, shape (3,). count: of what was measured.
+        sums: of measured times commanded values, of commanded squares and of measured squares, for
+            each time constant, dead time and axis, shape (3, lags, dead times, 3).
+        variance: of the noise, shape (3,). count: number of measurements.
     """
     right = _misfit(sums, GAINS)
     reverse = _misfit(sums, -GAINS)
-    at_rest = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn explains nothing
+    at_rest = sums[2].reshape(-1, 3).min(axis=0)  # residual without any rotation
     best = np.minimum(right, reverse)
     second = np.minimum(np.maximum(right, reverse), at_rest)
     noise = np.maximum(variance, best / count)
@@ -229,8 +233,8 @@ def _scores(sums: ndarray, variance: ndarray, count: int) -> ndarray:
 
 
 def _misfit(sums: ndarray, gains: ndarray) -> ndarray:
-    """Return the squares that the best time constant, dead time and gain between two leave, shape
-    (3,).
+    """Return the smallest sum of squared residuals over time constants, dead times and gains within
+    the given range, shape (3,).
     """
     product, commanded, measured = sums
     gain = np.clip(product / np.maximum(commanded, 1e-12), gains.min(), gains.max())

@@ -1,4 +1,4 @@
-"""The bodies' states at a tick, as the steps of the tick pass them on."""
+"""The bodies' states at a tick, passed from step to step."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ class Estimate:
     vehicle_level: int
     payload_level: int
     goal_level: int
-    shown_age: float  # of the vehicle's pose, as the policy knows it [s]
+    shown_age: float  # age of the vehicle's state that the policy gets [s]
 
     @property
     def is_complete(self) -> bool:
@@ -39,5 +39,5 @@ class Estimate:
 
     @property
     def fresh_payload(self) -> BodyState | None:
-        """State of the payload; None where its pose is stale."""
+        """State of the payload; None if its pose is stale."""
         return self.payload if self.payload_level < HOLD else None

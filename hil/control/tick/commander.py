@@ -1,6 +1,4 @@
-"""Act: the last step of a tick, from the decided state to commands. Judges a release that the
-policy asks for, and commands it.
-"""
+"""Act: the last step of a tick, from the decided state to commands, the release included."""
 
 import copy
 import math
@@ -25,34 +23,34 @@ from visthrow.onboard.pilot import PilotOutput
 
 HAND_OVER_SPEED = 1.0
 HAND_OVER_TILT = math.radians(20.0)
-"""Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on
-poses [m/s, rad].
+"""Speed [m/s] and tilt [rad] below which the autopilot's hold mode takes over after a throw. The
+runner brakes from larger tilts, up to 60 deg, on poses.
 """
 
-# a vehicle without poses is levelled for this long; then the autopilot has it, or nothing is sent
-# and its failsafes act [s]
+# a vehicle without poses is levelled for this long; then the autopilot holds it, or no command is
+# sent and its failsafes act [s]
 LEVEL_TIME = 0.5
 
-# calls of the policy before it flies: the first one compiles, the others warm the caches
+# calls of the policy before it flies: the first compiles, the others fill the caches
 WARM_CALLS = 3
 
 
 def is_level(vehicle: BodyState) -> bool:
-    """Return whether a vehicle is level enough for the autopilot's own hold."""
+    """Return whether a vehicle is level enough for the autopilot's hold mode."""
     return vehicle.quat is None or tilt_and_heading(vehicle.quat)[0] < HAND_OVER_TILT
 
 
 def can_hand_over(vehicle: BodyState) -> bool:
-    """Return whether a vehicle is slow and level enough for the autopilot's own hold."""
+    """Return whether a vehicle is slow and level enough for the autopilot's hold mode."""
     return is_level(vehicle) and math.hypot(*vehicle.vel) < HAND_OVER_SPEED
 
 
 class Commander:
-    """Acts in a state: commands the vehicle, asks for the autopilot's modes, releases the payload.
+    """Commands the vehicle, requests the autopilot's modes and releases the payload, by state.
 
     Attributes:
-        guard: with its counts.
-        calibration: result for the next tick, or why there is none.
+        guard: of the commands, with its counts.
+        calibration: result for the next tick, or why the calibration failed.
     """
 
     def __init__(self, parts: FlightParts):
@@ -68,7 +66,7 @@ class Commander:
         self._last_command = (parts.mass * GRAVITY, 0.0, 0.0, 0.0)
 
     def enter(self, estimate: Estimate, state: str) -> None:
-        """Do what a change of state requires."""
+        """Prepare for a new state, and stop a release whose time is over."""
         parts = self.parts
         time = estimate.time
         previous = self._state
@@ -80,8 +78,8 @@ class Commander:
             self._release_end = math.inf
 
     def act(self, estimate: Estimate, status: Status, record: TickRecord, begin: float) -> None:
-        """Command the vehicle, and note in the tick's record what was sent; ``begin`` of the tick
-        is a reading of `perf_counter`.
+        """Command the vehicle, and record what was sent; ``begin``: reading of `perf_counter` at
+        the tick's start.
         """
         parts = self.parts
         state = record.state
@@ -112,7 +110,7 @@ class Commander:
             end(record.time)
 
     def warm_up(self, vehicle: BodyState | None = None) -> None:
-        """Call the policy a few times on a copy: the first calls are slow."""
+        """Call a copy of the policy a few times, because the first calls are slow."""
         pilot = copy.copy(self.parts.pilot)
         params = self.parts.params
         pos = np.array([params.home_w if vehicle is None else vehicle.pos])
@@ -128,8 +126,8 @@ class Commander:
         time = estimate.time
         latch = self.parts.latch
         if previous == State.THROW:
-            # Where commands act late, a fast mechanism gets its command only after the policy's
-            # own time of separation.
+            # If commands act late, a fast mechanism is commanded only after the separation that the
+            # policy expects.
             latched = state == State.RECOVER and latch.at is not None
             self._release_end = latch.command_time if latched else time
         if state == State.ARMED:
@@ -148,7 +146,7 @@ class Commander:
     def _choose_command(
         self, estimate: Estimate, status: Status, record: TickRecord
     ) -> Command | None:
-        """Return the command of a state, before the guard; None for none."""
+        """Return the command of a state, before the guard; None for no command."""
         parts = self.parts
         state = record.state
         if state not in FLYING and state != State.ABORT:
@@ -169,7 +167,7 @@ class Commander:
         return parts.hovering.command(estimate.vehicle, mass)
 
     def _throw(self, estimate: Estimate, record: TickRecord) -> Command:
-        """Return the policy's command, and note whether its release is executed."""
+        """Return the policy's command, and record whether its release is executed."""
         parts = self.parts
         output = self._run_policy(estimate, record)
         record.ready = THROW if parts.latch.at is None else RELEASE
@@ -194,7 +192,7 @@ class Commander:
         return self.parts.aim.miss(estimate.time, payload, estimate.goal_w)
 
     def _run_policy(self, estimate: Estimate, record: TickRecord) -> PilotOutput:
-        """Run the policy on the estimate, and note its input and output."""
+        """Run the policy on the estimate, and record its input and output."""
         parts = self.parts
         vehicle = estimate.vehicle
         time = record.time
@@ -221,8 +219,8 @@ class Commander:
     def _add_sway(
         self, estimate: Estimate, status: Status, command: Command | None, record: TickRecord
     ) -> Command | None:
-        """Return the command with the sway of a calibration, and give the calibration what came in
-        this tick.
+        """Return the command with the calibration's sway added, and pass this tick's data to the
+        calibration.
         """
         parts = self.parts
         calibrating = self.parts.calibrating
@@ -248,7 +246,7 @@ class Commander:
         return (thrust, roll + added_roll, pitch + added_pitch, yaw)
 
     def _ask_mode(self, estimate: Estimate, state: str, status: Status) -> None:
-        """Ask the autopilot to follow, or to hold and land by itself where it can."""
+        """Ask the autopilot to follow, or to hold and land by itself if it has such modes."""
         parts = self.parts
         backend = self.parts.backend
         time = estimate.time
@@ -265,8 +263,8 @@ class Commander:
             backend.ask(LAND, time)
 
     def _must_level(self, estimate: Estimate) -> bool:
-        """Return whether the autopilot has to wait for a vehicle without poses that is still
-        tilted, which would sink in its hands.
+        """Return whether a vehicle without poses is still tilted and must be levelled before the
+        autopilot takes it, with which it would sink.
         """
         vehicle = self._reckoning.state
         if estimate.is_flyable or vehicle is None or self._reckoning.duration > LEVEL_TIME:
@@ -274,8 +272,8 @@ class Commander:
         return not is_level(vehicle)
 
     def _is_ours(self, state: str, status: Status) -> bool:
-        """Return whether commands are sent: not to a vehicle that was handed or taken over, that
-        hears nothing or was never ours.
+        """Return whether commands are sent: not to a vehicle that was handed over or taken over,
+        that is not connected, or that the runner never commanded.
         """
         hovers = state in (State.READY, State.ARMED)
         if self.parts.machine.handed_back or (status.mode in (HOLDING, LAND) and not hovers):
@@ -283,7 +281,7 @@ class Commander:
         return state != State.ABORT or (status.connected and self.parts.machine.flown)
 
     def _guard(self, command: Command | None, record: TickRecord) -> Command | None:
-        """Return a command within its limits; one that is not finite ends the run."""
+        """Return the command within its limits; a command that is not finite aborts the run."""
         if command is None:
             self.guard.reset()
             return None
@@ -301,8 +299,8 @@ class Commander:
     def _note_hover(
         self, estimate: Estimate, command: Command | None, rates: tuple[float, ...] | None
     ) -> None:
-        """Note the command of a tick in which the vehicle hovered by ours, None for another one,
-        and the body rates that the autopilot reported [rad/s].
+        """Record the command of a tick in which the vehicle hovered by the runner's commands, else
+        None, and the body rates that the autopilot reported [rad/s].
         """
         parts = self.parts
         share = None if command is None else command[0] / (parts.mass * GRAVITY)

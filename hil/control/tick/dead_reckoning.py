@@ -1,4 +1,4 @@
-"""The state of a vehicle whose poses have stopped, until it is level."""
+"""Dead reckoning of a vehicle without poses, until it is level."""
 
 import math
 from dataclasses import dataclass
@@ -9,25 +9,25 @@ from hil.poses.body_track import BodyState
 from visthrow.common.rotations import plus, rotate_one, turn_one
 from visthrow.onboard.hover import GRAVITY
 
-RESPONSE = 0.05  # time constant with which body rates follow their command [s]
+RESPONSE = 0.05  # time constant of the body rates' response to a command [s]
 ROUNDING = 1e-6  # tolerance of differences of times [s]
 
 
 @dataclass
 class DeadReckoning:
-    """An estimate that carries the last pose on by thrust and body rates."""
+    """A state estimate that is propagated from the last pose by thrust and body rates."""
 
     state: BodyState | None = None  # at the last tick; None before the first pose with an attitude
-    duration: float = 0.0  # for which it has been carried on [s]
+    duration: float = 0.0  # since the last pose [s]
     _arrival: float = 0.0  # of the last pose [s]
-    _time: float = 0.0  # that the state stands for [s]
+    _time: float = 0.0  # of the state [s]
     _reported: tuple[float, ...] | None = None
 
     def update(
         self, estimate: Estimate, rates: tuple[float, ...] | None, command: Command, mass: float
     ) -> None:
-        """Take a tick: body rates that the autopilot last reported [rad/s], the last command, and
-        the mass that flies [kg].
+        """Advance to a tick, with the body rates that the autopilot last reported [rad/s], the last
+        command [N, rad/s] and the flying mass [kg].
         """
         time = estimate.time
         vehicle = estimate.vehicle
@@ -51,7 +51,7 @@ class DeadReckoning:
 def _advance(
     state: BodyState, step: float, rates: tuple[float, ...] | None, command: Command, mass: float
 ) -> BodyState:
-    """Return a state after a step [s]; without new rates, they follow the command."""
+    """Return the state after a step [s]; without reported rates, body rates follow the command."""
     thrust, *commanded = command
     if rates is None:
         share = 1.0 - math.exp(-step / RESPONSE)

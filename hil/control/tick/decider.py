@@ -13,27 +13,27 @@ from hil.poses.gate import HOLD
 from hil.poses.pose import GOAL
 from visthrow.onboard.hover import GRAVITY
 
-PATIENCE = 10  # ticks of a throw in which the team agrees on nothing, as after a lost message
+PATIENCE = 10  # ticks of a throw without agreement that are tolerated: messages may be lost
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
-# reports that the autopilot's hover thrust is averaged over, and kept; share of the weight below
-# which it stands on the ground
+# number of reports that an average of the autopilot's hover thrust needs, and most that are kept;
+# share of the weight below which the vehicle stands on the ground
 FEWEST_REPORTS = 25
 MOST_REPORTS = 50
 GROUND_SHARE = 0.3
 
 
 class Decider:
-    """Moves the state machine on.
+    """Advances the state machine.
 
     Attributes:
-        inputs: of the machine at the last tick; None before it.
+        inputs: of the machine at the last tick; None before the first.
     """
 
     def __init__(self, parts: FlightParts):
         """Start before the first tick."""
         self.parts = parts
         self.inputs: Inputs | None = None
-        self._alone = 0  # ticks in which the team agreed on nothing
+        self._alone = 0  # ticks without agreement of the team
         self._shares: deque[float] = deque(maxlen=MOST_REPORTS)  # autopilot's thrust over weight
 
     def decide(
@@ -64,7 +64,7 @@ class Decider:
             failure = "the release was refused or not answered"
         checks = self._failed_checks(estimate, status)
         if vehicle is not None:
-            # A release that is not answered yet may still happen.
+            # A release that is not acknowledged yet may still happen.
             if state in (State.ARMED, State.RECOVER) and status.release != PENDING:
                 calm = parts.is_calm(estimate, status.mode == HOLDING)
             # A landing crosses the fence's floor on purpose.
@@ -98,12 +98,12 @@ class Decider:
         )
 
     def _failed_checks(self, estimate: Estimate, status: Status) -> list[str]:
-        """Return the failed pre-throw checks, in words."""
+        """Return texts of the failed pre-throw checks."""
         parts = self.parts
         params = self.parts.params
         state = self.parts.machine.state
-        # After a throw the payload may have been attached again; only the operator's next word
-        # resets the latch.
+        # After a throw the payload may have been attached again; only the operator's next command
+        # to arm resets the latch.
         thrown = state is State.THROW or (parts.latch.at is not None and state is not State.READY)
         if thrown or not estimate.is_complete:
             return ["a body has no pose yet"]
@@ -127,16 +127,16 @@ class Decider:
         return checks
 
     def _note_thrust(self, status: Status) -> None:
-        """Note the thrust that the autopilot hovers with by itself, until the take-over."""
+        """Record the thrust in the autopilot's own hover, until the take-over."""
         if status.thrust is None or self.parts.machine.flown:
             self._shares.clear()
         else:
             self._shares.append(status.thrust / (self.parts.mass * GRAVITY))
 
     def thrust_problems(self) -> list[str]:
-        """Return whether hovering takes another thrust than the weight, the autopilot's own hover
-        before the take-over, then ours: the calibration is wrong, the vehicle another, or the
-        battery low.
+        """Return texts on a hover thrust that differs from the weight, in the autopilot's own hover
+        before the take-over and in the runner's after it. A wrong calibration, another vehicle or a
+        low battery causes that.
         """
         parts = self.parts
         flown = self.parts.machine.flown
@@ -157,7 +157,7 @@ class Decider:
         return problems
 
     def _stream_problems(self, time: float) -> list[str]:
-        """Return what is wrong with the streams of poses; nothing after the take-over."""
+        """Return the problems of the pose streams; none after the take-over."""
         if self.parts.machine.state not in (State.IDLE, State.CHECK):
             return []
         return [
@@ -168,7 +168,7 @@ class Decider:
         ]
 
     def problems(self) -> list[str]:
-        """Return what forbids the take-over of the vehicle, as of the last tick."""
+        """Return the problems that forbid the take-over, as of the last tick."""
         inputs = self.inputs
         tracks = self.parts.tracks
         if inputs is None:

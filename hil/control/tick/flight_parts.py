@@ -19,28 +19,28 @@ from visthrow.onboard.policy import Policy
 
 CALM_OFFSET = 0.05
 CALM_SPEED = 0.25
-"""Distance of the vehicle from its hover point [m], and speed of vehicle and payload over 0.2 s
-[m/s], that count as calm: half of what the policies were trained to start from.
+"""Limits for calm: distance of the vehicle from its hover point [m], and speed of vehicle and
+payload over 0.2 s [m/s]. They are half of those from which the policies were trained to start.
 """
 
 
 class FlightParts:
-    """One vehicle with what observes, judges and commands it.
+    """The parts that observe, check and command one vehicle.
 
     Attributes:
         params, backend, pilot, machine: of the run.
         tracks: by body.
-        latch: of the release, with the landings so far. aim: judges releases.
-        hovering: on poses, where no policy flies.
-        response: of the first hover; None for a dry run.
-        detections: where keypoints are a detector's; else None.
-        calibrating: of the camera in the hover, where the config asks for it; else None.
+        latch: of the release, with the landings so far. aim: checks releases.
+        hovering: controller while no policy flies.
+        response: check of the first hover; None for a dry run.
+        detections: keypoints of a detector; None if there is none.
+        calibrating: calibration in the hover; None unless the config requests it.
         mass: of vehicle, rope and payload [kg]. vehicle_mass: of the vehicle [kg].
         hang: of the payload's centre below the vehicle's at rest [m].
         thrust_tolerance: of the hover, relative to the weight.
         trained_age: of the poses in training [s].
-        agreed: by the team for this tick; None without a team.
-        spent: by the stages of the last tick [s].
+        agreed: what the team agreed on for this tick; None without a team.
+        spent: times of the last tick's stages [s].
     """
 
     def __init__(self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float):
@@ -83,7 +83,7 @@ class FlightParts:
         self.spent: dict[str, float] = {}
 
     def carries_payload(self, estimate: Estimate) -> bool:
-        """Return whether the payload hangs on the vehicle, by the latch and by its own poses."""
+        """Return whether the payload hangs on the vehicle, by the latch and its own poses."""
         vehicle = estimate.vehicle
         payload = estimate.fresh_payload
         if vehicle is None:
@@ -92,8 +92,8 @@ class FlightParts:
         return self.latch.payload_hangs(estimate.time, vehicle.pos, place_w)
 
     def is_calm(self, estimate: Estimate, holding: bool) -> bool:
-        """Return whether nothing moves, at the hover point or where the autopilot holds the vehicle
-        by itself (``holding``).
+        """Return whether the vehicle is at its hover point and nothing moves; with ``holding``, the
+        autopilot holds the vehicle and its position does not count.
         """
         distance = math.dist(estimate.vehicle.pos, self.params.home_w)
         if not holding and distance > CALM_OFFSET:

@@ -1,10 +1,10 @@
-"""The runner: each tick from poses to a command, in three steps: estimate, decide, act.
+"""The runner, which turns poses into a command at each tick in three steps: estimate, decide, act.
 
-Nothing raises past it; what goes wrong ends in the abort state.
+It never raises: an exception puts it into the abort state.
 
-A tick depends on its time, the poses and detections since the last one, the back-end's status and
-the operator's words, and on nothing else; these are recorded, so that a replay repeats every
-decision to the last bit."""
+A tick depends only on its time, the poses and detections since the last tick, the back-end's status
+and the operator's commands. All of them are recorded, so that a replay repeats every decision bit
+for bit."""
 
 import traceback
 from dataclasses import asdict
@@ -22,7 +22,7 @@ from hil.poses.gate import ABORT
 from hil.poses.pose import Pose
 from visthrow.onboard.policy import Policy
 
-MOST_ERRORS = 100  # tracebacks that are kept
+MOST_ERRORS = 100  # tracebacks kept
 
 
 class Runner(FlightParts):
@@ -30,13 +30,13 @@ class Runner(FlightParts):
 
     Attributes:
         estimator, decider, commander: the three steps.
-        errors: tracebacks of what was caught, each once.
+        errors: tracebacks of caught exceptions, without duplicates.
     """
 
     def __init__(
         self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float = 0.0
     ):
-        """Build all parts; the mechanism's lag is from its command to separation [s].
+        """Build all parts; ``mechanism_lag``: from the mechanism's command to separation [s].
 
         Raises MismatchError, PolicyError: the camera is not the one that the policy was trained
         with, or the policy is incomplete; RunError: the mechanism is slower than the policy was
@@ -49,8 +49,8 @@ class Runner(FlightParts):
         self._early_error: Exception | None = None
 
     def take_poses(self, poses: list[Pose]) -> None:
-        """Take in poses before their tick, which then has less to do and decides as with all of
-        them. An exception is raised again in the tick.
+        """Process poses ahead of their tick, which then has less to do and decides the same. An
+        exception is raised again in the tick.
         """
         if self._early_error is not None:
             return
@@ -105,9 +105,7 @@ class Runner(FlightParts):
             raise error
 
     def fail(self, time: float, error: BaseException) -> TickRecord:
-        """Abort the run because of an exception: no further release, and the autopilot is asked to
-        land, tick by tick.
-        """
+        """Abort the run because of an exception: stop the release and ask the autopilot to land."""
         reason = "Ctrl-C twice"
         if isinstance(error, Exception):
             reason = f"{type(error).__name__}: {error}"
@@ -122,7 +120,7 @@ class Runner(FlightParts):
 
     @property
     def in_flight(self) -> bool:
-        """Whether the vehicle is ours and the run is not over."""
+        """Whether the runner has taken the vehicle and the run is not over."""
         return self.machine.flown and self.machine.state is not State.DONE
 
     def summary(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from hil.poses.gate import HOLD, OK, Tether
 from hil.poses.pose import GOAL, PAYLOAD, VEHICLE, Pose, Vector
 from hil.poses.sources.images import Hint
 
-# before the take-over a body that was refused or not seen for this long may reappear anywhere [s]
+# before the take-over, a body without an accepted pose for this long may reappear anywhere [s]
 REACQUIRE = 1.0
 
 
@@ -21,7 +21,7 @@ class StateEstimator:
 
     Attributes:
         goal_w: target as of the last tick [m].
-        watcher: called with the body and the track of each accepted pose; None for nobody.
+        watcher: called with body and track after each accepted pose; None: no call.
     """
 
     def __init__(self, parts: FlightParts):
@@ -35,7 +35,7 @@ class StateEstimator:
         self._reach = length + parts.params.check.rope_tolerance  # of the cable [m]
 
     def take_poses(self, poses: list[Pose]) -> None:
-        """Take in raw poses."""
+        """Process raw poses."""
         parts = self.parts
         for pose in poses:
             track = parts.tracks.get(pose.body)
@@ -48,7 +48,7 @@ class StateEstimator:
                 parts.latch.follow(time, track.gate.last.pos)
 
     def take_detections(self, detections: list[Detection]) -> None:
-        """Take in a camera's detections since the last tick; only the newest counts."""
+        """Process a camera's detections since the last tick; only the newest is kept."""
         if detections:
             self._detection = detections[-1]
 
@@ -60,7 +60,8 @@ class StateEstimator:
         parts.latch.overdue(time)
         if parts.machine.state in (State.IDLE, State.CHECK):
             for track in tracks.values():
-                # On the ground a body may be carried about unseen; in flight a jump stays refused.
+                # On the ground a body may be carried about without poses; in flight a jump stays
+                # rejected.
                 if REACQUIRE < track.gate.age(time) < math.inf:
                     track.restart()
         states = {body: self._state(track, time) for body, track in tracks.items()}
@@ -80,7 +81,7 @@ class StateEstimator:
         )
 
     def show_detection(self, estimate: Estimate, record: TickRecord) -> None:
-        """Turn the newest detection into keypoints, and note it in the tick's record."""
+        """Turn the newest detection into keypoints, and add it to the tick's record."""
         detections = self.parts.detections
         detection = self._detection
         self._detection = None
@@ -122,8 +123,8 @@ class StateEstimator:
         return Tether(pos, self._reach if fresh else math.inf)
 
     def _state(self, track: Track, time: float) -> BodyState | None:
-        """Return the state of a body, predicted to the age that the policy was trained with where
-        the config says so.
+        """Return the state of a body, predicted to the age that the policy was trained with if the
+        config requests it.
         """
         delay = self.parts.params.delay
         age = self._age(track, time)
