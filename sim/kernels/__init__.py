@@ -1,3 +1,3 @@
-"""The batched simulator on Warp: types and arrays, blocks of the vehicle and of the rope, and the
-kernels that are composed of them.
+"""The batched simulator on Warp: types, arrays, blocks of vehicle and rope, and the kernels that
+are composed of these blocks.
 """

@@ -1,10 +1,10 @@
-"""The step in parts, for bodies that a solver outside holds: what happens between two exchanges.
+"""Kernels of a control step whose bodies an external solver advances.
 
-The paper's simulator (Sec. III-B): the quadrotor's blocks give one wrench a substep, a solver
-advances the bodies, and the blocks see the root's kinematics then. Substeps are equal here: a
-command acts from the substep whose middle it reaches, and a separation within a substep is
-interpolated between its ends. A wrench is that of the substep's middle, which is predicted, to
-second order. After the release the vehicle flies on by itself, without the solver."""
+As in the paper's simulator (Sec. III-B), the quadrotor's blocks compute one wrench per substep, the
+solver advances the bodies, and the blocks then read the root's kinematics. All substeps have the
+same length: a command acts from the first substep whose midpoint is not before its time, and the
+time of a separation is interpolated within a substep. The wrench is that at the predicted midpoint
+of the substep (second order). After the release, the vehicle flies without the solver."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -29,15 +29,16 @@ WRENCH_FIELDS = {
     "pull_w": "vec3",
     "twist_b": "vec3",
 }
-"""What a solver is given, held over a substep: force [N] and torque [N m] of the vehicle's blocks
-about its centre of mass, body frame, without gravity; force of the air on the payload [N]. And what
-the rope did to the vehicle in the last substep, by which the next middle is predicted."""
+"""Input of the solver, constant over a substep: force [N] and torque [N m] of the vehicle's blocks
+about its centre of mass, body frame, without gravity; force of the air on the payload [N]. Also the
+rope's force and torque on the vehicle in the last substep, used to predict the next midpoint."""
 
 FLAG_FIELDS = {
     "moves": "int",
     "redrawn": "int",
 }
-"""Non-zero: the plant moves in this step; the solver's bodies are put to its state after it."""
+"""Non-zero: the plant moves in this step; the solver's bodies are set to its state after the step.
+"""
 
 BODY_FIELDS = {
     "pos_w": "vec3",
@@ -49,13 +50,13 @@ BODY_FIELDS = {
     "payload_pos_w": "vec3",
     "payload_vel_w": "vec3",
 }
-"""What a solver shows of its bodies: the root, the rope's segments, the payload's centre."""
+"""State of the solver's bodies: root, rope segments, payload's centre."""
 
 
 def build_body_access(t: Types, segments: int):
     """Return Warp functions ``load_bodies(bodies, env, s, n, u) -> s`` and
-    ``store_bodies(bodies, env, s, n, u, payload_pos, payload_vel)``, between a struct of
-    :data:`BODY_FIELDS` and a vehicle's state with local arrays of its rope.
+    ``store_bodies(bodies, env, s, n, u, payload_pos, payload_vel)``, which copy a struct of
+    :data:`BODY_FIELDS` to a vehicle's state with local arrays of its rope, and back.
     """
     QuadState = t.QuadState
     vec3 = t.vec3
@@ -108,7 +109,8 @@ class ExchangeKernels:
 
 def build_bodies(t: Types, parts: SimpleNamespace, segments: int):
     """Return the structs ``Wrench`` and ``Bodies``, ``load_bodies`` of :func:`build_body_access`,
-    and the kernels that show the plant in the bodies and put out the bodies' payload."""
+    the kernel that copies the plant's state to the bodies, and the kernel that outputs the payload.
+    """
     vec3 = t.vec3
     L = segments
     State = parts.State
@@ -128,7 +130,7 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int):
         bodies: Bodies,
         wrench: Wrench,
     ):
-        """Copy bodies from the state; the payload follows from the rope."""
+        """Copy the state to the bodies; the payload's state follows from the rope."""
         env = wp.tid() + first
         if mask[env] == 0:
             return
@@ -162,7 +164,7 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int):
 def build_exchange(
     t: Types, params: PlantParams, step: StepKernels, extensions: frozenset[str]
 ) -> ExchangeKernels:
-    """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
+    """Build the kernels from the parts of the fused step of the same plant and ``extensions``."""
     real = t.real
     zero = real(0.0)
     vec3 = t.vec3
@@ -196,7 +198,7 @@ def build_exchange(
         flags: Flags,
         out: Output,
     ):
-        """Take the command, trip the latch."""
+        """Queue the command, and start the release's timer if the release is commanded."""
         env = wp.tid() + first
         flags.moves[env] = inputs.mask[env]
         flags.redrawn[env] = 0
@@ -229,7 +231,9 @@ def build_exchange(
         # Out:
         wrench: Wrench,
     ):
-        """Advance what is the blocks' own from ``time`` on and fill in the wrench of the middle."""
+        """Advance the internal states of the blocks from ``time`` on, and write the wrench at the
+        midpoint.
+        """
         env = wp.tid() + first
         wrench.force_b[env] = vec3()
         wrench.torque_b[env] = vec3()
@@ -296,7 +300,9 @@ def build_exchange(
         # Out:
         out: Output,
     ):
-        """Take over where the solver brought the bodies by ``time``, h seconds on; let go."""
+        """Read the bodies after the solver's substep of h seconds, which ends at ``time``, and
+        separate the payload if its timer has elapsed.
+        """
         env = wp.tid() + first
         if flags.moves[env] == 0 or state.attached[env] == 0:
             return

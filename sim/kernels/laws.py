@@ -1,15 +1,15 @@
-"""Laws that a diagnosis found, as blocks of the fused kernel: coefficient times up to two scalars
-times one vector.
+"""Force laws of a diagnosis as blocks of the fused kernel: a coefficient times up to two scalars
+times a vector.
 
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of
-its factors into the kernel that is built for it; its coefficient is a number of the run, so that
-one kernel serves every size of a law. The factors are those of ``sim/law_factors.toml``, made of
-the quantities of ``sim/law_factors.py``, of which ``visthrow.diagnose.models.law_terms`` makes the
-same in NumPy. A law's force is taken at the start of an integration step and held over it.
+its factors into a kernel. The coefficient is a run-time parameter, so one kernel serves all sizes
+of a law. The factors are those of ``sim/law_factors.toml``, composed of the quantities of
+``sim/law_factors.py``; ``visthrow.diagnose.models.law_terms`` computes them in NumPy. A law's force
+is evaluated at the start of an integration step and held during the step.
 
-A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that
-does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its
-opposite at the mount. Momentum is conserved."""
+A torque M in the rope's joint acts on the vehicle, and -M on the rope. The latter is replaced by
+the equivalent pair of forces on a straight rope of length l and direction n: (-M x n) / l on the
+payload, and the opposite force at the mount. So momentum is conserved."""
 
 from functools import cache
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ AROUND = {
     "tension": "real",
     "neighbour_pos_w": "vec3",
 }
-"""What factors are made of: name -> type."""
+"""Quantities of which factors are composed: name -> type."""
 
 
 @wp.func
@@ -116,7 +116,7 @@ STATES = {
     "tension": tension,
     "neighbour_pos_w": neighbour,
 }
-"""Quantities that a state holds."""
+"""Name of a quantity -> the function that reads it."""
 
 
 @wp.func
@@ -189,7 +189,7 @@ def _compose_two(operation, first, second):
 
 @cache
 def quantity(name: str):
-    """Return the function of a quantity of the state, or of one that follows from it."""
+    """Return the function that evaluates a quantity, read from the state or derived from it."""
     if name in STATES:
         return STATES[name]
     if name in UNITS:
@@ -203,29 +203,31 @@ def _functions(rows):
     return {name: quantity(row[2]) for name, row in rows.items()}
 
 
-MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds
+MEASURED = LAW_FACTORS["measured"]  # factors of quantities that only a log has
 
 SCALARS = _functions(LAW_FACTORS["scalars"] | MEASURED["scalars"])
-"""Scalars that a law may name."""
+"""Scalar factors: name -> function."""
 
 VECTORS = {
     block: _functions(rows | MEASURED["vectors"].get(block, {}))
     for block, rows in LAW_FACTORS["vectors"].items()
 }
-"""Vectors that a law of each block may name; forces in the world frame, torques in the body's."""
+"""Block -> vectors of its laws, name -> function; forces in the world frame, torques in the body
+frame.
+"""
 
 BLOCKS = tuple(VECTORS)
 
 
 def structure(laws: tuple[LawParams, ...]) -> tuple:
-    """The constants a kernel is built for: everything of the laws but their coefficients."""
+    """Return the constants for which a kernel is built: the laws without their coefficients."""
     return tuple((law.block, law.factors, law.vector) for law in laws)
 
 
 def check_laws(laws: tuple[LawParams, ...], measured: bool = False) -> None:
-    """Raise ValueError for laws that no blocks can be made of.
+    """Raise ValueError if there are too many laws, or one needs a quantity that is not available.
 
-    ``measured``: whether what a log alone holds is there.
+    ``measured``: whether quantities that only a log has are available.
     """
     if len(laws) > MOST_LAWS:
         raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
@@ -245,9 +247,9 @@ def check_laws(laws: tuple[LawParams, ...], measured: bool = False) -> None:
 def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleNamespace:
     """Compose the laws of a plant.
 
-    Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command,
-    attached)`` -> air whose pushes hold the laws' forces besides its own, and ``in_flight(air,
-    vel_w)`` [N] on a payload that has left. Without laws both do nothing."""
+    Returns a namespace of Warp functions: ``on(p, rope, air, state, n, u, stiffness, command,
+    attached)`` returns the air with the laws' forces added to its pushes; ``in_flight(air, vel_w)``
+    returns the force [N] on a released payload. Without laws, there are no such forces."""
     vec3 = t.vec3
     Vectors = t.Vectors
     vec4 = t.vec4
@@ -282,7 +284,7 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleName
 
     @wp.func
     def act_in_joint(a: Around, air: Air):
-        """The air whose pushes hold the torque in the rope's joint and its reactions besides."""
+        """Return the air with the torque in the rope's joint and its reactions added."""
         out = air
         on_vehicle = joint(a, air.laws)
         arm = reach(a)

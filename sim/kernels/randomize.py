@@ -1,12 +1,11 @@
-"""Start of an episode on the device: placing a plant at rest in its actuators, and the paper's
+"""Start of an episode on the device: initialisation of the actuators, and the paper's
 randomisation.
 
 The release's lag is not drawn here: it is constant in a plant, and drawn with each vehicle of a
 fleet (:mod:`sim.scaling.vehicle_class`).
 
-Random numbers are counter-based: they depend on the seed, the environment and how often it was
-reset, so a masked reset leaves all others untouched and a batch draws what its members alone would
-draw."""
+Random numbers depend only on the seed, the environment and the number of its resets. So a masked
+reset does not affect other environments, and an environment draws the same numbers in any batch."""
 
 from dataclasses import dataclass
 
@@ -22,14 +21,14 @@ from sim.params import PlantParams
 
 @dataclass(frozen=True)
 class ResetKernels:
-    """Kernels that start episodes."""
+    """Kernels that start an episode."""
 
     place: wp.Kernel
     randomize: wp.Kernel
 
 
 def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> ResetKernels:
-    """Build the reset kernels for a number of segments; ``hangs``: whether a rope does."""
+    """Build the reset kernels; ``hangs``: whether the vehicle carries a rope."""
     real = t.real
     vec3 = t.vec3
     Plants = t.Plants
@@ -40,7 +39,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
 
     @wp.func
     def uniform(size: vec3, rng: wp.uint32):
-        """Uniform numbers of at most these sizes, and the generator after them."""
+        """Return uniform random numbers within +-``size``, and the generator's next state."""
         x = size[0] * real(wp.randf(rng, -1.0, 1.0))
         y = size[1] * real(wp.randf(rng, -1.0, 1.0))
         z = size[2] * real(wp.randf(rng, -1.0, 1.0))
@@ -48,7 +47,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
 
     @wp.func
     def settle(plants: Plants, state: State, env: int, used: real):
-        """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
+        """Set motors, controller, battery, queue, rope and release as in hover."""
         p = vehicle_of(plants, state, env)
         rope = rope_of(plants, env)
         gravity = plants.gravity

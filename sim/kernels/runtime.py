@@ -1,4 +1,4 @@
-"""Start of Warp for the simulator."""
+"""Initialisation of Warp, and the decorator of the simulator's kernels."""
 
 from functools import partial
 
@@ -9,9 +9,9 @@ from camera.warp_start import start
 start()
 
 unique_kernel = partial(wp.kernel, module="unique", enable_backward=False)
-"""Decorator of the kernels that one build composes: each is a module by itself, forward only.
+"""Decorator of composed kernels: each is a Warp module of its own, without backward pass.
 
-It takes other options of ``wp.kernel`` too.
+It accepts the other options of ``wp.kernel``.
 """
 
 Ints = wp.array(dtype=wp.int32)

@@ -1,7 +1,7 @@
-"""State of a batch of plants as Warp arrays, and what one control step puts out.
+"""State of a batch of plants, and inputs and outputs of a control step, as Warp arrays.
 
-Shapes use E environments and L rope segments. Rope arrays stand segment first, (L, E), so that
-neighbouring threads read neighbouring memory."""
+E: number of environments, L: number of rope segments. Rope arrays have the segment first, (L, E),
+so that neighbouring threads read neighbouring memory."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -16,10 +16,10 @@ from sim.kernels.structs import QUAD_STATE, Types, make_struct
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])  # attitude of a level vehicle, xyzw
 
 NONFINITE = 1
-"""Status bit: a state became non-finite or faster than any physical one; the environment was put
-back to its last good state. Or the command was not finite, and the last one was held.
+"""Status bit: the state became non-finite or exceeded :data:`SPEED_LIMIT`, and the environment was
+reset to its last valid state; or the command was not finite, and the last one was held.
 """
-# status bit: a rod turned faster than a substep resolves; the first-order stage was kept there
+# status bit: a rod turned faster than a substep resolves; that step has first order only
 FALLBACK = 2
 COLLISION = 4  # status bit: the payload came closer to the vehicle than both radii
 ROPE_IN_ROTOR = 8  # status bit: a joint of the rope passed through a propeller disc
@@ -30,7 +30,7 @@ ROPE_FIELDS = {
     "stiffness": "real[]",
 }
 
-STATE_FIELDS = {  # those with [] have a row a segment, the queue a row a slot
+STATE_FIELDS = {  # types with [] have a row for each segment, that of the queue for each slot
     **QUAD_STATE,
     "mass_scale": "real",
     **ROPE_FIELDS,
@@ -38,23 +38,23 @@ STATE_FIELDS = {  # those with [] have a row a segment, the queue a row a slot
     "release_timer": "real",  # time to separation [s]; negative: not latched
     "attached": "int",
     "status": "int",
-    "force_w": "vec3",  # from outside [N], where the extension "push" is built in
-    "torque_b": "vec3",  # likewise [N m], about the centre of mass
+    "force_w": "vec3",  # external force [N]; needs the extension "push"
+    "torque_b": "vec3",  # external torque [N m] about the centre of mass, likewise
 }
 
 INPUT_FIELDS = {
     "command": "vec4",
-    "release": "int",  # non-zero asks for it
-    "mask": "int",  # non-zero: this plant moves
+    "release": "int",  # non-zero: release the payload
+    "mask": "int",  # non-zero: advance this plant
 }
-"""What a step is given. In one struct, since Warp compiles a kernel for CPUs twice if arrays are
-arguments of their own: once for contiguous ones.
+"""Inputs of a step. They form a struct, as Warp compiles a kernel for CPUs twice if it has arrays
+as arguments, once for contiguous ones.
 """
 
 OUTPUT_FIELDS = {
     "payload_pos_w": "vec3",
     "payload_vel_w": "vec3",  # at the end of the step, or at separation once released
-    "separated": "int",  # separation happened within this step
+    "separated": "int",  # non-zero: the payload separated within this step
     "landing_w": "vec3",
     "time_to_impact": "real",
     "clearance": "real",
@@ -64,7 +64,9 @@ OUTPUT_FIELDS = {
 
 
 def array_struct(t: Types, name: str, fields: dict[str, str]) -> type:
-    """Warp struct of an array for each field, of a type of :class:`Types`; with ``[]``, by row."""
+    """Return a Warp struct of arrays; ``fields``: name -> type of :class:`Types`, with ``[]`` for
+    arrays of two dimensions.
+    """
     arrays = {}
     for field, kind in fields.items():
         dtype = wp.int32 if kind == "int" else getattr(t, kind.removesuffix("[]"))
@@ -73,7 +75,7 @@ def array_struct(t: Types, name: str, fields: dict[str, str]) -> type:
 
 
 def allocate(struct: Any, count: int, device: str, rows: Mapping[str, int] = MappingProxyType({})):
-    """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
+    """Return an instance of ``struct`` with zeroed arrays of shape (E,) or (rows[name], E)."""
     out = struct()
     for name, field in struct.vars.items():
         shape = (rows[name], count) if field.type.ndim == 2 else count
@@ -84,16 +86,16 @@ def allocate(struct: Any, count: int, device: str, rows: Mapping[str, int] = Map
 def put(
     t: Types, struct, initial: Mapping[str, tuple[ndarray | None, ndarray]], count: int
 ) -> None:
-    """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment
-    first.
+    """Copy host arrays, with the environment first, into arrays of a struct, where rope arrays have
+    the segment first.
 
-    Raises ValueError: values of another shape.
+    Raises ValueError: values have another shape.
 
     Args:
         t: types of the arrays.
-        struct: of :func:`allocate`, or anything with arrays of these names.
-        initial: name -> values, shape (E, ...), or None for every environment's default; and that
-            default, shape (...).
+        struct: of :func:`allocate`, or any object with arrays of these names.
+        initial: name -> (values, default): values of shape (E, ...), None for the default in every
+            environment; default of shape (...).
         count: E.
     """
     real = np.float32 if t.real is wp.float32 else np.float64
@@ -113,19 +115,17 @@ def put(
 
 
 def fetch(array: wp.array) -> ndarray:
-    """Copy of a device array, environment first."""
+    """Return a copy of a device array with the environment first."""
     value = array.numpy()  # on the CPU a view of the simulator's memory
     return np.array(np.swapaxes(value, 0, 1) if array.ndim == 2 else value)
 
 
-SPEED_LIMIT = 1000.0  # of `size` [m/s], [rad/s]: beyond it a state is broken, not fast
+SPEED_LIMIT = 1000.0  # limit of `size` [m/s], [rad/s]: a state above it is invalid
 
 
 @wp.func
 def size(s: Any):
-    """Sum of the sizes of a vehicle's state, which is not below any limit where a part of it is
-    NaN.
-    """
+    """Return a weighted sum of the norms of a vehicle's state; NaN if a part of it is NaN."""
     milli = type(s.voltage)(1.0e-3)
     total = (
         wp.length(s.vel_w) + wp.length(s.rate_b) + wp.length(s.quat_wb) + wp.length(s.pos_w) * milli
@@ -142,7 +142,7 @@ def size(s: Any):
 
 @wp.func
 def vehicle_of(plants: Any, state: Any, env: int):
-    """Parameters of an environment's vehicle, with its mass."""
+    """Return the parameters of an environment's vehicle, with its mass scaled."""
     p = plants.vehicles[env % plants.vehicles.shape[0]]
     p.body.mass = p.body.mass * state.mass_scale[env]
     return p
@@ -150,19 +150,19 @@ def vehicle_of(plants: Any, state: Any, env: int):
 
 @wp.func
 def rope_of(plants: Any, env: int):
-    """Parameters of an environment's rope."""
+    """Return the parameters of an environment's rope."""
     return plants.ropes[env % plants.ropes.shape[0]]
 
 
 @wp.func
 def release_of(plants: Any, env: int):
-    """Parameters of an environment's release."""
+    """Return the parameters of an environment's release."""
     return plants.releases[env % plants.releases.shape[0]]
 
 
 @wp.func
 def air_of(plants: Any, state: Any, env: int):
-    """Air about an environment, with the wrench from outside."""
+    """Return the parameters of an environment's air, with the external wrench added."""
     air = plants.airs[env % plants.airs.shape[0]]
     air.push_w = air.push_w + state.force_w[env]
     air.twist_b = air.twist_b + state.torque_b[env]
@@ -207,8 +207,8 @@ def build_access(t: Types, State: type):
 
 
 def build_rope_access(t: Types, segments: int):
-    """Return Warp functions ``load_rope(state, env, n, u, stiffness)`` and ``store_rope``, between
-    arrays of :data:`ROPE_FIELDS` in a struct and local ones.
+    """Return Warp functions ``load_rope(state, env, n, u, stiffness)`` and ``store_rope``, which
+    copy the arrays of :data:`ROPE_FIELDS` of a struct to local arrays and back.
     """
     Vectors = t.Vectors
     Reals = t.Reals

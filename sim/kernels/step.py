@@ -1,9 +1,9 @@
-"""The fused control step: command queue, blocks, chain, release and checks of one control period in
-one kernel.
+"""The fused control step: one kernel with the command queue, blocks, chain, release and checks of
+one control period.
 
-``build_step`` composes the functions of one choice of blocks into one kernel. One thread an
-environment, no atomics, nothing else is launched; the same kernel runs on the CPU, all at once or
-some from ``first`` on, and on CUDA."""
+``build_step`` composes the functions of the chosen blocks into the kernel. It has one thread per
+environment and no atomics. The same kernel runs on CUDA and on the CPU, there also in pieces that
+begin at environment ``first``."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -53,9 +53,9 @@ def build_parts(
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
     Returns a namespace of the structs ``State``, ``Input`` and ``Output`` and of Warp functions:
-    the blocks' ``flow`` and ``advance``; ``chain``, ``coupled`` and ``laws`` with theirs;
+    the blocks' ``flow`` and ``advance``; the namespaces ``chain``, ``coupled`` and ``laws``;
     ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and ``hazards``; ``depart``,
-    which writes what follows when the payload separates with a stated velocity."""
+    which writes the outputs of a separation."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
@@ -80,7 +80,7 @@ def build_parts(
 
     @wp.func
     def rope_size(u: Vectors, n: Vectors):
-        """Sum of the sizes of the rope's state."""
+        """Return the sum of the norms of the rope's state."""
         total = real(0.0)
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
@@ -88,8 +88,8 @@ def build_parts(
 
     @wp.func
     def hazards(p: t.Vehicle, rope: Rope, s: QuadState, n: Vectors, payload_pos: vec3):
-        """Bits of the status: the payload strikes the vehicle; a joint of the rope stands within a
-        propeller disc, one centimetre thick."""
+        """Return status bits: the payload hits the vehicle; a joint of the rope is within a
+        propeller disc, taken as 2 cm thick."""
         status = int(0)
         if wp.length(payload_pos - s.pos_w) < rope.payload_radius + p.collision_radius:
             status = st.COLLISION
@@ -118,7 +118,7 @@ def build_parts(
         env: int,
         elapsed: real,
     ):
-        """Write what follows from the payload's state at separation, without the kick."""
+        """Write the outputs of a separation; ``vel``: of the payload before the kick."""
         vel = rel.kick(r, vel, direction_w)
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
@@ -162,14 +162,14 @@ def build_step(
     """Compose the kernel for the kinds and the number of segments of ``params``.
 
     Args:
-        t: types of the wanted precision.
-        params: kinds and segment count are read here; all numbers are read by the kernel at run
+        t: types of the precision.
+        params: only kinds and number of segments are used; the kernel reads all numbers at run
             time.
-        direct: by-pass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
+        direct: bypass the blocks; see :func:`sim.kernels.quadrotor.rigid_body.build_direct_flow`.
         extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost
             nothing.
-        motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
-        integrator: of a vehicle that carries nothing.
+        motors: bypass the rate controller: commands are motor-speed set-points [rad/s].
+        integrator: of a vehicle without payload.
     """
     real = t.real
     zero = real(0.0)
@@ -201,7 +201,7 @@ def build_step(
         env: int,
         elapsed: real,
     ):
-        """Write what follows from the payload's state at separation."""
+        """Write the outputs of a separation at this state."""
         mount = mount_position(rope, s)
         mount_vel = mount_velocity(rope, s)
         pos, vel = chain.payload(rope, mount, mount_vel, n, u)

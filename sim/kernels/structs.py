@@ -1,8 +1,8 @@
-"""Warp structs of the parameters and of the vehicle's state, made for one floating-point precision.
+"""Warp structs of the parameters and of the vehicle's state, for one floating-point precision.
 
-The dataclasses of :mod:`sim.params` are the only place where a parameter is declared:
-:class:`Types` derives the Warp struct of each from its annotations, so a field added there reaches
-the kernels under the same name."""
+Parameters are declared only in the dataclasses of :mod:`sim.params`. :class:`Types` derives a Warp
+struct from the annotations of each, so a field added there is available in kernels under the same
+name."""
 
 import dataclasses
 import typing
@@ -39,12 +39,12 @@ ROPE_NUMBERS = (
     "payload_side",
     "payload_lift",
     "compliance",
-    "strain",  # of a rope that gives, as it stands
+    "strain",  # current strain of an elastic rope
     "strain_rate",  # [1/s]
-    "stretched_share",  # of the last rod: how much of its lengthening its centre follows
+    "stretched_share",  # displacement of the last rod's centre of mass per elongation of the rod
     "total_mass",
 )
-"""Scalars of the device's rope, beside its mount."""
+"""Scalars of the struct of a rope, in addition to the vector ``mount``."""
 
 
 NUMERICS = ("control_period", "substep", "gamma", "max_turn")
@@ -64,7 +64,7 @@ QUAD_STATE = {
 }
 """State of a quadrotor: name -> type."""
 QUAD_RATE = QUAD_STATE | {"acting": "vec4", "force_b": "vec3", "torque_b": "vec3"}
-"""Its time derivative, with the motor speeds that act and the wrench of the blocks."""
+"""Time derivative of the state, with the acting motor speeds and the wrench of the blocks."""
 
 
 class Types:
@@ -76,14 +76,13 @@ class Types:
             ``mixer``.
         Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``,
             ``segment_mass``, ...).
-        Air: struct of :class:`sim.params.AirParams`, the coefficients of the plant's ``laws``, and
-            what pushes from outside
-            during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
-                mass, ``payload_push_w`` [N]; for laws of a replay the measured
-                ``neighbour_pos_w`` [m], and ``thrust_rate`` [N/s] where attitudes are
-                imposed.
-        Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
-            an entry for one environment or all, and the numerics. rows: types of these arrays.
+        Air: struct of :class:`sim.params.AirParams` with the coefficients of the plant's ``laws``
+            and external forces during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m]
+            about its centre of mass, ``payload_push_w`` [N]. For laws of a replay also the measured
+            ``neighbour_pos_w`` [m], and ``thrust_rate`` [N/s] if attitudes are imposed.
+        Plants: parameters of a batch: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
+            with one entry per environment or one for all, and the numerics. rows: types of these
+            arrays.
         Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.
         QuadState, QuadRate: state of the quadrotor alone, and :data:`QUAD_RATE`.
     """
@@ -124,7 +123,7 @@ class Types:
         self.QuadRate = self.from_names("QuadRate", QUAD_RATE)
 
     def from_names(self, name: str, fields: dict[str, str]) -> type:
-        """Return a struct of fields of the types that this class has by these names."""
+        """Return a struct; ``fields``: name -> name of an attribute of this class, the type."""
         return make_struct(name, {field: getattr(self, kind) for field, kind in fields.items()})
 
     def _field_type(self, annotation) -> type | None:
@@ -136,7 +135,7 @@ class Types:
             return {3: self.vec3, 4: self.vec4}[len(typing.get_args(annotation))]
         if dataclasses.is_dataclass(annotation):
             return self.from_dataclass(annotation, {})
-        return None  # kinds are chosen when the kernel is built; they are no run-time parameters
+        return None  # kinds of blocks are chosen when the kernel is built
 
     def from_dataclass(self, schema: type, extra: dict[str, type]) -> type:
         hints = typing.get_type_hints(schema)
@@ -148,9 +147,10 @@ class Types:
 
 @lru_cache
 def types(precision: str) -> Types:
-    """Types of ``"float32"`` or ``"float64"``; made once, so that kernels of one precision share
-    their structs.
-    """
+    """Return the types of ``"float32"`` or ``"float64"``, cached, so that all kernels of a
+    precision share their structs.
+
+    Raises ValueError: another precision."""
     if precision not in ("float32", "float64"):
         raise ValueError(f"precision {precision!r}; expected 'float32' or 'float64'")
     return Types(wp.float32 if precision == "float32" else wp.float64)
@@ -158,7 +158,7 @@ def types(precision: str) -> Types:
 
 @lru_cache
 def _numpy_type(struct: type) -> np.dtype:
-    """Return the NumPy type of a struct's rows; Warp works it out anew each time."""
+    """Return the NumPy type of a struct's rows, cached, as Warp derives it anew at each call."""
     return struct.numpy_dtype()
 
 
@@ -174,7 +174,9 @@ def _fill(row: np.void, value) -> None:
 
 
 def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
-    """Kinds of controller, motor, battery and aerodynamics: what a kernel is built for."""
+    """Return the kinds of controller, motor, battery and aerodynamics, for which a kernel is
+    built.
+    """
     return vehicle.controller.kind, vehicle.motor.kind, vehicle.battery.kind, vehicle.aero.kind
 
 
@@ -185,14 +187,15 @@ EXTENSIONS = {
     "swing_damping": "swing_damping",  # friction across the rope
     "downwash": "downwash",  # the rotors' jet on the payload
     "payload_spin": "payload_side payload_lift",  # side force and lift of a payload in flight
-    "compliance": "compliance",  # rope that gives
-    "lag_tension": "lag_tension",  # release lag that depends on the rope's pull
+    "compliance": "compliance",  # elastic rope
+    "lag_tension": "lag_tension",  # release lag that depends on the rope's tension
     "rope_tail": "rope_tail",  # rope that leaves with the payload
-    "push": "",  # forces from outside
+    "push": "",  # external forces
 }
-"""Parts of the blocks that a kernel holds only if it was built for them -> fields of rope, air or
-release that need them where they are not zero. Those of the release, which cost nothing, are in
-every kernel."""
+"""Optional part of the blocks -> fields of rope, air or release that need it if they are not zero.
+
+A kernel holds only the parts for which it was built. The parts of the release are in every kernel,
+as they cost nothing."""
 
 
 def extensions_of(
@@ -201,9 +204,7 @@ def extensions_of(
     releases: Iterable[P.ReleaseParams] = (),
     laws: Sequence[P.LawParams] = (),
 ) -> frozenset[str]:
-    """Names of :data:`EXTENSIONS` without which one of these plants would not be
-    simulated in full.
-    """
+    """Return the names of :data:`EXTENSIONS` that these plants need."""
     needed = {"push"} if laws else set()
     for part in (*ropes, *airs, *releases):
         for name, fields in EXTENSIONS.items():
@@ -216,11 +217,11 @@ def extensions_of(
 def pack_vehicle(
     t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]
 ) -> ndarray:
-    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a kernel of
-    blocks of these kinds.
+    """Return a structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a
+    kernel of blocks of these kinds.
 
-    Raises ValueError: other kinds of blocks, or rotors without torque, which no mixer can command
-    yaw with."""
+    Raises ValueError: a vehicle has other kinds of blocks, or rotors without drag torque, with
+    which a mixer cannot control yaw."""
     rows = pack(t.Vehicle, *vehicles)
     for row, vehicle in zip(rows, vehicles, strict=True):
         if kinds_of(vehicle) != kinds:
@@ -240,8 +241,8 @@ def pack_vehicle(
         row["mixer"]["roll"] = y / (4 * np.mean(y**2))
         row["mixer"]["pitch"] = -x / (4 * np.mean(x**2))
         row["mixer"]["yaw"] = spin / (4 * thrust.torque_ratio)
-        # Arms about the centre of mass, and the drag torque as the rotors have it, not as the
-        # controller knows it.
+        # Arms about the centre of mass, and the true drag torque: the controller's mixer uses the
+        # nominal one.
         for name, com in zip("xyz", vehicle.body.com, strict=True):
             row["rotors"][name] = np.asarray(getattr(rotors, name)) - com
         row["thrust"]["torque_ratio"] = thrust.torque_ratio * thrust.torque_gain
@@ -249,8 +250,8 @@ def pack_vehicle(
 
 
 def pack(struct: type, *values) -> ndarray:
-    """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it
-    was derived from.
+    """Return a structured array for ``wp.array(dtype=struct)``, with a row for each of the
+    dataclass instances ``values``.
     """
     rows = np.zeros(len(values), dtype=_numpy_type(struct))
     for row, value in zip(rows, values, strict=True):
@@ -259,8 +260,8 @@ def pack(struct: type, *values) -> ndarray:
 
 
 def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> ndarray:
-    """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of
-    its plant's laws.
+    """Return a structured array for ``wp.array(dtype=t.Air)``, with a row for each air and the
+    coefficients of its plant's laws.
     """
     rows = pack(t.Air, *airs)
     for row, row_laws in zip(rows, laws, strict=True):
@@ -269,10 +270,10 @@ def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ..
 
 
 def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list[P.RopeParams]:
-    """The ropes with their mounts stated from the centre of mass of the vehicle that each hangs on.
+    """Return the ropes with their mounts relative to their vehicles' centres of mass.
 
-    Raises ValueError: vehicles whose centres of mass differ, and ropes that cannot be paired with
-    them."""
+    Raises ValueError: centres of mass differ, but there is not one rope, or one for each vehicle.
+    """
     coms = [v.body.com for v in vehicles]
     if len(set(coms)) > 1:
         if len(ropes) not in (1, len(vehicles)):
@@ -290,10 +291,10 @@ def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list
 
 
 def pack_rope(t: Types, ropes: list[P.RopeParams]) -> ndarray:
-    """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
+    """Return a structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
 
-    The last rod carries the payload: its mass, centre and transverse inertia about its upper joint
-    are combined here."""
+    Mass, centre and transverse inertia (about the upper joint) of the last rod include the payload.
+    """
     rows = pack(t.Rope, *ropes)
     for row, rope in zip(rows, ropes, strict=True):
         length = rope.segment_length
@@ -323,9 +324,9 @@ def pack_plants(
     releases: list[P.ReleaseParams],
     laws: list[tuple[P.LawParams, ...]] | None = None,
 ) -> dict[str, ndarray]:
-    """Return structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``;
-    ``laws``: of the airs' plants, those of ``like`` without.
-    """
+    """Return structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``.
+
+    ``laws``: of the plant of each of ``airs``; by default those of ``like``."""
     return {
         "vehicles": pack_vehicle(t, vehicles, kinds_of(like.vehicle)),
         "ropes": pack_rope(t, ropes),
@@ -337,7 +338,9 @@ def pack_plants(
 def plants_on(
     t: Types, rows: dict[str, ndarray], sim: P.SimParams, gravity: float, device: str
 ) -> typing.Any:
-    """Return a struct ``t.Plants`` on a device with these rows and numerics; gravity [m/s^2]."""
+    """Return a struct ``t.Plants`` on a device; ``rows``: of :func:`pack_plants`; ``gravity``:
+    [m/s^2].
+    """
     plants = t.Plants()
     for name, packed in rows.items():
         setattr(plants, name, wp.array(packed, dtype=t.rows[name], device=device))

@@ -2,5 +2,5 @@
 functions.
 
 Every function is generic over the precision: its arguments are structs and vectors of
-:class:`sim.kernels.structs.Types`. Parameters ``p`` are always the whole vehicle struct. The
-equations stand in :mod:`sim.params`."""
+:class:`sim.kernels.structs.Types`. The argument ``p`` is always the whole vehicle struct. The
+equations are in :mod:`sim.params`."""

@@ -10,7 +10,8 @@ import warp as wp
 
 @wp.func
 def aero_rotor_drag(p: Any, vel_b: Any, rate_b: Any, thrust: Any):
-    """Force [N], torque [N m] (both body frame, about the centre of mass) added to the rotors' own.
+    """Return force [N] and torque [N m] of the air in addition to thrust and drag torque of the
+    rotors in still air, both in the body frame, about the centre of mass.
 
     Args:
         p: vehicle.
@@ -46,6 +47,6 @@ def aero_rotor_drag(p: Any, vel_b: Any, rate_b: Any, thrust: Any):
 
 @wp.func
 def aero_none(p: Any, vel_b: Any, rate_b: Any, thrust: Any):
-    """No aerodynamics (the ablation)."""
+    """Return no force and no torque (the ablation)."""
     none = vel_b - vel_b
     return none, none

@@ -10,15 +10,15 @@ import warp as wp
 
 @wp.func
 def open_circuit_voltage(p: Any, used: Any):
-    """Open-circuit voltage [V] at the fraction of charge used."""
+    """Return the open-circuit voltage [V] at a used fraction of the charge."""
     c = p.battery.ocv
     return c[0] + used * (c[1] + used * (c[2] + used * c[3]))
 
 
 @wp.func
 def battery_sag(p: Any, used: Any, voltage: Any, motor_speed: Any, thrust: Any):
-    """Derivatives of the used fraction [1/s] and of the terminal voltage [V/s] under the rotors'
-    load.
+    """Return the derivatives of the used fraction [1/s] and of the terminal voltage [V/s] under the
+    rotors' load.
     """
     power = (
         p.battery.idle_power
@@ -32,5 +32,5 @@ def battery_sag(p: Any, used: Any, voltage: Any, motor_speed: Any, thrust: Any):
 
 @wp.func
 def battery_ideal(p: Any, used: Any, voltage: Any, motor_speed: Any, thrust: Any):
-    """An endless pack at the reference voltage."""
+    """Return zero derivatives: charge and voltage are constant."""
     return used - used, voltage - voltage

@@ -19,8 +19,8 @@ def compose(
     aero_force: Any,
     aero_torque: Any,
 ):
-    """Net force [N] and torque [N m] on the vehicle, body frame, about the centre of mass, without
-    gravity.
+    """Return the net force [N] and torque [N m] on the vehicle, body frame, about the centre of
+    mass, without gravity.
 
     The rotors' gyroscopic torque ``-w x h e_z`` is perpendicular to the rate and does no work.
     """

@@ -10,7 +10,9 @@ import warp as wp
 
 @wp.func
 def speeds_of_thrusts(p: Any, f: Any):
-    """Motor speeds [rad/s], shape (4,), that give thrusts [N], shape (4,), by the quadratic map."""
+    """Return the motor speeds [rad/s], shape (4,), of thrusts [N], shape (4,), by the quadratic
+    map.
+    """
     speed = f
     for i in range(4):
         speed[i] = wp.sqrt(wp.max(f[i], f[i] - f[i]) / p.thrust.k_f)
@@ -19,8 +21,8 @@ def speeds_of_thrusts(p: Any, f: Any):
 
 @wp.func
 def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
-    """Yaw share of a motor's thrust [N] that keeps the spread of all four within ``room``, given
-    roll and pitch.
+    """Clip the yaw part of a motor's thrust [N] so that the thrusts of all four differ by at most
+    ``room`` [N]; ``roll_pitch``: their roll and pitch part [N].
     """
     big = type(yaw)(1.0e6)
     high_plus = -big
@@ -42,11 +44,11 @@ def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
 
 @wp.func
 def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
-    """Distribute thrust [N] and torque [N m] over four rotors; gives up yaw first, then collective,
-    then roll and pitch.
+    """Distribute thrust [N] and torque [N m] to four rotors. In saturation, yaw is reduced first,
+    then the collective thrust, then roll and pitch.
 
-    Returns the thrust of each rotor [N], shape (4,), and the delivered shares of the roll-pitch and
-    of the yaw demand, 0 to 1."""
+    Returns the thrust of each rotor [N], shape (4,), and the delivered shares of the roll and pitch
+    demand and of the yaw demand, 0 to 1."""
     zero = collective - collective
     room = max_thrust - p.controller.min_thrust
     roll_pitch = p.mixer.roll * torque_b[0] + p.mixer.pitch * torque_b[1]
@@ -73,7 +75,7 @@ def mix(p: Any, collective: Any, torque_b: Any, max_thrust: Any):
 def rate_controller_betaflight(
     p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
 ):
-    """PID with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
+    """Compute a PID law with feed-forward, filtered gyro and smoothed set-point, after Betaflight.
 
     Returns motor-speed set-points [rad/s], shape (4,), and the derivatives of integral, set-point
     filter and gyro filter."""
@@ -109,10 +111,11 @@ def rate_controller_betaflight(
 def rate_controller_motor_mixing(
     p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
 ):
-    """PID whose output is added to motor commands, with iterm_relax, as Betaflight's firmware has
-    them.
+    """Compute a PID law whose output is added to the motor commands, with iterm_relax, as in
+    Betaflight's firmware.
 
-    Returns what `rate_controller_betaflight` does; the set-point filter is that of iterm_relax.
+    Returns the same values as `rate_controller_betaflight`; the set-point filter is that of
+    iterm_relax.
     """
     c = p.controller
     zero = voltage - voltage
@@ -157,9 +160,10 @@ def rate_controller_motor_mixing(
 def rate_controller_geometric(
     p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
 ):
-    """Proportional rate controller with the gyroscopic term, each rotor clipped by itself (the
-    paper's ablation).
-    """
+    """Compute a proportional law with the gyroscopic term; each rotor's thrust is clipped on its
+    own (the paper's ablation).
+
+    Returns the same values as `rate_controller_betaflight`; the derivatives are zero."""
     rate_command = type(rate_b)(command[1], command[2], command[3])
     momentum = wp.cw_mul(p.body.inertia, rate_b)
     torque = p.controller.geometric_gain * wp.cw_mul(
@@ -177,8 +181,6 @@ def rate_controller_geometric(
 def motor_speeds(
     p: Any, command: Any, rate_b: Any, integral: Any, setpoint: Any, gyro: Any, voltage: Any
 ):
-    """The controller by-passed: commands are motor-speed set-points [rad/s], shape (4,), from
-    outside.
-    """
+    """Return the command, motor-speed set-points [rad/s], shape (4,), without a controller."""
     zero = rate_b - rate_b
     return command, zero, zero, zero

@@ -1,4 +1,4 @@
-"""One integration step of a quadrotor that carries nothing: Euler, Heun or RK4.
+"""Integration step of a quadrotor without payload: Euler, Heun or RK4.
 
 Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (Heun's method,
 and the classical method of order 4)."""
@@ -12,12 +12,12 @@ from sim.kernels.structs import Types
 
 
 def build_quad_step(t: Types, flow, advance, integrator: str):
-    """Return ``step(p, air, s, command, gravity, h) -> state`` of one integrator."""
+    """Return the function ``step(p, air, s, command, gravity, h) -> state`` of an integrator."""
     real = t.real
 
     @wp.func
     def slope(p: Any, air: Any, s: Any, command: Any, gravity: Any):
-        """Derivative of the state."""
+        """Return the derivative of the state."""
         r = flow(p, air, s, command)
         inv_mass = real(1.0) / p.body.mass
         r.vel_w = inv_mass * wp.quat_rotate(s.quat_wb, r.force_b) + gravity

@@ -1,7 +1,7 @@
 """Motor model. Equations: :class:`sim.params.MotorParams`.
 
-``motor_rate`` gives the speed that acts now and its derivative. An instantaneous motor has none: a
-step ends with the speed that acted last."""
+Each function returns the acting speed and its derivative. The speed of an instantaneous motor has
+no derivative: a step ends with the speed that acted last."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ import warp as wp
 
 @wp.func
 def motor_rate_first_order(p: Any, speed: Any, target: Any):
-    """Speed [rad/s] and its derivative [rad/s^2], each of shape (4,)."""
+    """Return the speed [rad/s] and its derivative [rad/s^2], each of shape (4,)."""
     return speed, (target - speed) / p.motor.time_constant
 
 
 @wp.func
 def motor_rate_asymmetric(p: Any, speed: Any, target: Any):
-    """Speed [rad/s] and its derivative [rad/s^2], each of shape (4,): slower or faster where the
-    rotor slows down.
+    """Return the speed [rad/s] and its derivative [rad/s^2], each of shape (4,), with another time
+    constant for rotors that slow down.
     """
     rate = (target - speed) / p.motor.time_constant
     for i in range(4):
@@ -28,5 +28,5 @@ def motor_rate_asymmetric(p: Any, speed: Any, target: Any):
 
 @wp.func
 def motor_rate_instant(p: Any, speed: Any, target: Any):
-    """Speed [rad/s] and its derivative, each of shape (4,): the set-point, at once."""
+    """Return the set-point [rad/s] and a zero derivative, each of shape (4,)."""
     return target, target - target

@@ -1,9 +1,9 @@
 """Command queue: a continuous delay of the zero-order-held command.
 
-Convention: commands stand newest first; slot j holds the command that the policy gave j control
-periods ago. With ``delay = whole * period + rest`` the command of slot ``whole + 1`` acts until
-``rest`` into the period, that of slot ``whole`` from then on. The step ends a substep exactly
-there, so the delay is exact, not rounded to substeps."""
+Convention: the newest command is first; slot j holds the command that was sent j control periods
+ago. With ``delay = whole * period + rest``, the command of slot ``whole + 1`` acts until the time
+``rest`` of the period, and that of slot ``whole`` from then on. A substep ends exactly there, so
+the delay is not rounded to substeps."""
 
 import math
 from typing import Any
@@ -12,7 +12,9 @@ import warp as wp
 
 
 def queue_depth(delay: float, period: float) -> int:
-    """Slots that a delay needs. Raises ValueError for a negative or non-finite one."""
+    """Return the number of slots that a delay needs. Raises ValueError if it is negative or not
+    finite.
+    """
     if not (math.isfinite(delay) and delay >= 0):
         raise ValueError(f"command delay {delay} s; expected 0 or more")
     return int(math.floor(delay / period + 1e-6)) + 2
@@ -20,8 +22,8 @@ def queue_depth(delay: float, period: float) -> int:
 
 @wp.func
 def split_delay(p: Any, period: Any):
-    """Split the delay into whole periods and the rest [s]; a rest below a microsecond counts as
-    none.
+    """Split the delay into a number of whole periods and the rest [s]; a rest below a microsecond
+    is 0.
     """
     tiny = type(period)(1.0e-6)
     whole = wp.floor(p.queue.delay / period + tiny / period)
@@ -35,8 +37,8 @@ def split_delay(p: Any, period: Any):
 def command_at(
     queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: Any, period: Any
 ):
-    """The command that acts at a time of a control period [s], and until when [s]; ``whole`` and
-    ``switch`` are of `split_delay`.
+    """Return the command that acts at a time in a control period [s], and the time until which it
+    acts [s]; ``whole`` and ``switch`` are from `split_delay`.
     """
     slot = whole
     until = period
@@ -48,10 +50,10 @@ def command_at(
 
 @wp.func
 def push(queue: wp.array2d(dtype=Any), env: int, command: Any):
-    """Put a command into slot 0 of an environment's queue, shape (D, E); the others move on by one.
+    """Insert a command into slot 0 of an environment's queue, shape (D, E); the others move by one
+    slot.
 
-    Returns whether the command was finite. One that is not is left out: the last one is held in its
-    place."""
+    Returns whether the command is finite. If it is not, the last command is held instead."""
     depth = queue.shape[0]
     for k in range(depth - 1):
         queue[depth - 1 - k, env] = queue[depth - 2 - k, env]

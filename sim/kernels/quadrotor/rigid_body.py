@@ -1,7 +1,7 @@
-"""The quadrotor's state as one struct: derivative from the blocks, advance along a derivative.
+"""Rigid-body dynamics of the quadrotor: derivative of its state, and step along a derivative.
 
-``build_flow`` composes the seven blocks for one choice of kinds; the result is what both the hybrid
-simulator and a quadrotor without a rope integrate."""
+``build_flow`` composes the seven blocks of the chosen kinds. The hybrid simulator and a quadrotor
+without a rope both integrate the result."""
 
 from typing import Any
 
@@ -27,7 +27,7 @@ AEROS = {"rotor_drag": aero.aero_rotor_drag, "none": aero.aero_none}
 
 @wp.func
 def quat_rate(quat_wb: Any, rate_b: Any):
-    """Time derivative of the attitude: half of ``quat_wb * (rate_b, 0)``."""
+    """Return the time derivative of the attitude, half of ``quat_wb * (rate_b, 0)``."""
     half = type(rate_b[0])(0.5)
     return quat_wb * type(quat_wb)(
         rate_b[0] * half, rate_b[1] * half, rate_b[2] * half, rate_b[0] - rate_b[0]
@@ -36,26 +36,26 @@ def quat_rate(quat_wb: Any, rate_b: Any):
 
 @wp.func
 def angular_acceleration(p: Any, rate_b: Any, torque_b: Any):
-    """Euler's equation: ``J^-1 (torque - w x J w)`` [rad/s^2], body frame."""
+    """Return the angular acceleration ``J^-1 (torque - w x J w)`` [rad/s^2], body frame."""
     momentum = wp.cw_mul(p.body.inertia, rate_b)
     return wp.cw_div(torque_b - wp.cross(rate_b, momentum), p.body.inertia)
 
 
 @wp.func
 def mount_position(rope: Any, s: Any):
-    """Position of the rope's mount [m], world frame."""
+    """Return the position of the rope's mount [m], world frame."""
     return s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
 
 
 @wp.func
 def mount_velocity(rope: Any, s: Any):
-    """Velocity of the rope's mount [m/s], world frame."""
+    """Return the velocity of the rope's mount [m/s], world frame."""
     return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
 
 
 @wp.func
 def advance(s: Any, r: Any, h: Any):
-    """State after moving along the derivative ``r`` for ``h`` seconds; the attitude is
+    """Return the state after ``h`` seconds along the derivative ``r``; the attitude is
     normalised.
     """
     out = s
@@ -74,7 +74,7 @@ def advance(s: Any, r: Any, h: Any):
 
 @wp.func
 def advance_instant(s: Any, r: Any, h: Any):
-    """:func:`advance` with motors that reach their set-points at once."""
+    """Return :func:`advance` for motors that reach their set-points at once."""
     out = advance(s, r, h)
     out.motor_speed = r.acting
     return out
@@ -82,7 +82,7 @@ def advance_instant(s: Any, r: Any, h: Any):
 
 @wp.func
 def blend(a: Any, wa: Any, b: Any, wb: Any):
-    """Weighted sum of two derivatives, with the motor speeds and the wrench of the first."""
+    """Return the weighted sum of two derivatives, with acting motor speeds and wrench of ``a``."""
     out = a
     out.pos_w = wa * a.pos_w + wb * b.pos_w
     out.quat_wb = a.quat_wb * wa + b.quat_wb * wb
@@ -98,13 +98,13 @@ def blend(a: Any, wa: Any, b: Any, wb: Any):
 
 
 def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str], motors: bool):
-    """Compose the blocks of a vehicle's kinds.
+    """Compose the blocks of a vehicle.
 
     Args:
-        t: types of the wanted precision.
-        vehicle: its kinds are read here.
+        t: types of the precision.
+        vehicle: only its kinds of blocks are used.
         extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
-        motors: in place of the vehicle's controller, commands are motor-speed set-points.
+        motors: commands are motor-speed set-points, without the vehicle's controller.
 
     Returns:
         ``flow(p, air, state, command) -> t.QuadRate``, whose accelerations are left at zero, and
@@ -151,10 +151,10 @@ def build_flow(t: Types, vehicle: VehicleParams, extensions: frozenset[str], mot
 
 
 def build_direct_flow(t: Types):
-    """The blocks by-passed: the command is (thrust [N], torque [N m] about x, y, z), acting at once
-    and exactly.
+    """Return ``flow`` without blocks: the command is (thrust [N], torque [N m] about x, y, z) and
+    acts at once.
 
-    The bare dynamics of the tests' scenes, and an idealised vehicle.
+    It is used for the rigid-body dynamics of tests, and for an idealised vehicle.
     """
     vec3 = t.vec3
     real = t.real

@@ -1,4 +1,4 @@
-"""Actuators, filters, battery and command queue of a vehicle in steady hover: where every episode
+"""Steady hover of actuators, filters, battery and command queue, from which every episode
 starts.
 """
 
@@ -13,8 +13,8 @@ from sim.params import VehicleParams
 
 @wp.func
 def hover_speed(p: Any, thrust: Any, voltage: Any):
-    """Motor speed [rad/s] at which one rotor gives a thrust [N] under a voltage [V]; inverts the
-    whole thrust map.
+    """Return the motor speed [rad/s] at which a rotor has a thrust [N] at a voltage [V], by the
+    inverse of the complete thrust map.
     """
     one = type(thrust)(1.0)
     two = type(thrust)(2.0)
@@ -29,8 +29,8 @@ def hover_speed(p: Any, thrust: Any, voltage: Any):
 
 @wp.func
 def hover_voltage(p: Any, used: Any, thrust: Any, speed: Any):
-    """Terminal voltage [V] that a pack settles at while it feeds hover: the upper root of ``u^2 -
-    u_oc u + R P = 0``.
+    """Return the steady terminal voltage [V] in hover, the upper root of ``u^2 - u_oc u + R P =
+    0``.
     """
     power = p.battery.idle_power + thrust * speed * p.thrust.torque_ratio / p.battery.efficiency
     source = open_circuit_voltage(p, used)
@@ -41,9 +41,8 @@ def hover_voltage(p: Any, used: Any, thrust: Any, speed: Any):
 def build_steady_hover(t: Types, vehicle: VehicleParams, State: type):
     """Build ``set_steady_hover(p, state, env, thrust, used)`` for a struct of state arrays.
 
-    It puts motors, filters, battery and queue of an environment in hover under a collective thrust
-    [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
-    rate must have been set before."""
+    It sets motors, filters, battery and queue of an environment to hover with a collective thrust
+    [N] and a fraction ``used`` of the charge used. The body rate must have been set before."""
     real = t.real
     zero = real(0.0)
     vec4 = t.vec4
@@ -56,7 +55,7 @@ def build_steady_hover(t: Types, vehicle: VehicleParams, State: type):
         if wp.static(ideal):
             charge_used = real(0.0)
         else:
-            # speed and voltage depend on each other weakly: each round gains three digits
+            # speed and voltage depend weakly on each other: an iteration gains three digits
             for _ in range(4):
                 voltage = hover_voltage(
                     p, used, thrust, hover_speed(p, thrust / real(4.0), voltage)

@@ -1,4 +1,4 @@
-"""Thrust and torque of the rotors from motor speed and battery voltage.
+"""Thrust and drag torque of the rotors, from motor speed and battery voltage.
 
 Equations: :class:`sim.params.ThrustParams`.
 """
@@ -10,7 +10,7 @@ import warp as wp
 
 @wp.func
 def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
-    """Thrust of each rotor [N], shape (4,)."""
+    """Return the thrust of each rotor [N], shape (4,), without individual gains."""
     scale = type(voltage)(1.0) + p.thrust.voltage_coefficient * (
         voltage - p.battery.reference_voltage
     )
@@ -19,13 +19,13 @@ def rotor_thrust(p: Any, motor_speed: Any, voltage: Any):
 
 @wp.func
 def rotor_thrust_scaled(p: Any, motor_speed: Any, voltage: Any):
-    """Thrust of each rotor [N], shape (4,), with individual gains."""
+    """Return the thrust of each rotor [N], shape (4,), with individual gains."""
     return wp.cw_mul(p.thrust.gain, rotor_thrust(p, motor_speed, voltage))
 
 
 @wp.func
 def near_ground(p: Any, air: Any, height: Any, thrust: Any):
-    """Thrust of each rotor [N], shape (4,), at a height [m] of the vehicle.
+    """Return the thrust of each rotor [N], shape (4,), in ground effect at a height [m].
 
     Equation: :class:`sim.params.AirParams`.
     """
@@ -37,5 +37,5 @@ def near_ground(p: Any, air: Any, height: Any, thrust: Any):
 
 @wp.func
 def rotor_torque(p: Any, thrust: Any):
-    """Magnitude of each rotor's drag torque [N m], shape (4,)."""
+    """Return the magnitude of each rotor's drag torque [N m], shape (4,)."""
     return p.thrust.torque_ratio * thrust

@@ -1,3 +1,3 @@
-"""Event-exact replay of recorded commands through the simulator's blocks, many perturbed lanes at
-once.
+"""Event-exact replay of recorded commands through the simulator's blocks, in many perturbed
+lanes.
 """

@@ -1,9 +1,9 @@
-"""The replay as one kernel: a lane flies one window of a recorded flight with its initial state and
-parameters.
+"""The replay kernel: each lane simulates a window of a recorded flight, with an initial state and
+parameters of its own.
 
-Every switch of the command, the latch, the separation and the knots of the latent forces end a step
-exactly; measured stamps lie inside steps and are read from the cubic through both ends. One thread
-a lane, no atomics."""
+A step ends exactly at every change of the command, at the latch, the separation and the knots of
+the latent forces. At measured stamps, the state is interpolated within a step by a cubic. There is
+one thread per lane, and no atomics."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -25,10 +25,10 @@ from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
-# the replay has every extension built in, so that lanes may differ in all of them
+# all extensions are built in, so that lanes may differ in any of them
 EVERYTHING = frozenset(EXTENSIONS)
 
-# how the payload starts: on the rope, flying, or not there
+# state of the payload at the start: on the rope, in flight, or none
 ATTACHED = 1
 LOOSE = 0
 NO_PAYLOAD = 2
@@ -36,28 +36,27 @@ NO_PAYLOAD = 2
 STATE_FIELDS = {
     **QUAD_STATE,
     **st.ROPE_FIELDS,
-    "payload_pos_w": "vec3",  # where it starts loose, and where it is at the end
+    "payload_pos_w": "vec3",  # at the start, if loose, and at the end
     "payload_vel_w": "vec3",
-    # at the end alone: when the rope first went slack [s], and when it last came taut again;
-    # before the window's start if it did not
+    # only at the end: time at which the rope first became slack [s], and at which it last became
+    # taut again; before the window's start if it did not
     "slack_first": "real",
     "slack_last": "real",
 }
 
-# share of the payload's weight below which the rope counts as slack: its shape is then anyone's
-# guess
+# tension per weight of the payload below which the rope is slack and its shape unknown
 SLACK = 0.15
 
 CPU_OPTIONS = (
     " -ffp-contract=fast -mreassociate -fno-signed-zeros -fno-slp-vectorize"
     " -mllvm=-inline-threshold=20000"
 )
-"""Options of the compiler for CPUs: fused multiply-add, as on a GPU, sums in any order, no vectors
-of neighbouring scalars, and every function inlined into the loop. NaN and infinity stay as they
-are: a lane that diverges must end.
+"""Options of the compiler for CPUs: fused multiply-add, as on a GPU, sums in any order, no
+vectorisation of neighbouring scalars, and inlining of every function. NaN and infinity are
+respected, since a diverging lane must end.
 """
 
-TINY = 1.0e-9  # times [s] nearer than this are one
+TINY = 1.0e-9  # times [s] that differ by less are equal
 
 WINDOW_FIELDS = {
     "start": "real",  # [s], clock of the flight
@@ -65,7 +64,7 @@ WINDOW_FIELDS = {
     "first_knot": "real",  # of the latent forces
     "knots": "int",
     "payload": "int",  # ATTACHED, LOOSE or NO_PAYLOAD
-    "latch": "real",  # of the release, any time after the end if none
+    "latch": "real",  # time of the release's latch; after the end if there is none
     "clock_zero": "real",  # start of the flight
     "command_first": "int",  # range of the flight's commands
     "command_last": "int",
@@ -81,16 +80,17 @@ LANE_FIELDS = {
     "window": "int",
     "plant": "int",  # row of the parameters
     "state": "int",  # row of the initial states
-    # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
+    # component of the latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force; -1:
+    # none
     "axis": "int",
-    "knot": "int",
+    "knot": "int",  # of the latent force
     "size": "real",  # of the latent force at its knot [N], [N m]
     "substep": "real",  # largest step [s]
-    "keep": "int",  # first row of its knots' states in the knot arrays, or -1
-    "resume": "int",  # row of the knot arrays at which it leaves the lane that kept it, or -1
-    "parent": "int",  # that lane, flown before, of the same window, plant and state
-    "skip": "int",  # command in whose place the one before stays, or -1
-    # of a lane from a start: so many after it share its flight and differ in what sensors show
+    "keep": "int",  # first row of the states at its knots in the knot arrays; -1: not kept
+    "resume": "int",  # row of the knot arrays from which it continues the parent; -1: from a start
+    "parent": "int",  # lane simulated before, with the same window, plant and state
+    "skip": "int",  # command that is left out, the one before acts on; -1: none
+    # number of lanes after this one that share its flight and differ only in the sensing
     "shared": "int",
 }
 
@@ -116,17 +116,17 @@ DATA_FIELDS = {
 
 IMPOSED_FIELDS = {
     "thrust_rate": "real",  # of all motors together [N/s]
-    "attitude": "quat",  # when the command begins to act
-    "turn_b": "vec3",  # rate at which that turns while it acts [rad/s]
-    "turn_acc_b": "vec3",  # by which a vehicle is turned besides what torques do [rad/s^2]
-    "neighbour_pos_w": "vec3",  # measured position of what may push the vehicle [m]
+    "attitude": "quat",  # at the command's time
+    "turn_b": "vec3",  # rate of that attitude while the command acts [rad/s]
+    "turn_acc_b": "vec3",  # angular acceleration in addition to that of torques [rad/s^2]
+    "neighbour_pos_w": "vec3",  # measured position of a body that may push the vehicle [m]
 }
-"""Of each command, in a replay that imposes attitudes."""
+"""Additional fields of each command, in a replay with imposed attitudes."""
 
 
 @dataclass(frozen=True)
 class ReplayKernel:
-    """The kernel of one choice of blocks and the structs that it takes."""
+    """The kernel for a choice of blocks, and the structs that it takes."""
 
     replay: wp.Kernel
     State: type
@@ -142,7 +142,7 @@ class ReplayKernel:
 
 @wp.func
 def push_at(air: Any, axis: int, size: Any, share: Any):
-    """The latent force of a lane at a share of its peak."""
+    """Return the air with the latent force of a lane; ``share``: of its size."""
     out = air
     force = air.push_w - air.push_w
     if axis >= 0:
@@ -158,7 +158,7 @@ def push_at(air: Any, axis: int, size: Any, share: Any):
 
 @wp.func
 def latest_command(windows: Any, w: int, data: Any, command: int, delay: Any, time: Any):
-    """Latest command of a window that acts by ``time``, ``command`` or one after it."""
+    """Return the index of the latest command that acts at ``time``, ``command`` or a later one."""
     latest = int(command)
     last = windows.command_last[w]
     while latest + 1 < last and data.command_time[latest + 1] + delay <= time:
@@ -168,8 +168,8 @@ def latest_command(windows: Any, w: int, data: Any, command: int, delay: Any, ti
 
 @wp.func
 def next_event(m: Any, windows: Any, w: int, data: Any, command: int, delay: Any):
-    """Time at which the next command acts, the latch trips or the payload separates, or of the
-    window's end.
+    """Return the time of the next event: a command begins to act, the latch opens, the payload
+    separates, or the window ends.
     """
     until = windows.end[w]
     if command + 1 < windows.command_last[w]:
@@ -183,7 +183,7 @@ def next_event(m: Any, windows: Any, w: int, data: Any, command: int, delay: Any
 
 @wp.func
 def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
-    """A lane that knows whether its rope is slack after a step, and since when."""
+    """Return the lane with the state of its rope, slack or taut, updated after a step."""
     out = m
     if pull < type(pull)(SLACK) * weight:
         out.slack = 1
@@ -197,7 +197,7 @@ def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
 
 @wp.func
 def imposed_attitude(like: Any, data: Any, command: int, time: Any):
-    """Attitude (of the type of ``like``) that is imposed while a command acts."""
+    """Return the imposed attitude at a time in which a command acts, of the type of ``like``."""
     since = time - data.command_time[command]
     return data.attitude[command] * rotation_of_vector(like, since * data.turn_b[command])
 
@@ -227,7 +227,7 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
         u: Vectors,
         stiffness: Reals,
     ):
-        """A lane at its window's start; n, u and stiffness are filled in."""
+        """Return a lane at the start of its window, and fill n, u and stiffness."""
         m = Moment()
         m.time = windows.start[w]
         m.quad = load_quad(starts, start)
@@ -239,7 +239,7 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
             pos, vel = coupled.payload(m.rope, m.quad, n, u)
             m.pay = pos
             m.pay_vel = vel
-            if windows.latch[w] <= m.time:  # the pull at the latch lies before this window
+            if windows.latch[w] <= m.time:  # tension at the latch unknown
                 m.separation = wp.max(windows.latch[w] + r.lag, m.time)
                 m.latched = 1
         else:
@@ -266,7 +266,7 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
         stiffness: Reals,
         gravity: real,
     ):
-        """A lane after what is due of its release: the latch trips, or the payload separates."""
+        """Return the lane after the events of its release that are due: latch and separation."""
         out = m
         if m.mode == attached_code:
             if latch <= m.time + tiny and m.latched == 0:
@@ -285,7 +285,9 @@ def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_q
 
 
 def build_keeping(t: Types, structs: SimpleNamespace, chain, store_quad, store_rope):
-    """Build ``write_knot`` and ``write_end``, which write the states that a lane keeps."""
+    """Build ``write_knot`` and ``write_end``, which store a lane's states at knots and at the
+    end.
+    """
     real = t.real
     Moment = structs.Moment
     Vectors = t.Vectors
@@ -335,11 +337,11 @@ def build_replay(
     laws: tuple[LawParams, ...],
     imposed: bool,
 ) -> ReplayKernel:
-    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
-    numbers are read at run time.
+    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws.
+    Numbers are read at run time.
 
-    ``imposed``: whether the vehicle takes recorded attitudes, whatever its torques are; its rates
-    are simulated beside them. Commands are motor speeds then."""
+    ``imposed``: whether the vehicle follows recorded attitudes instead of those by its torques. Its
+    rates are still simulated, and commands are motor speeds."""
     real = t.real
     vec3 = t.vec3
     L = segments
@@ -450,7 +452,7 @@ def build_replay(
                 k.t0 = m.time + real(float(j)) * h
                 k.t1 = k.t0 + h
                 k.h = h
-                if wp.static(imposed):  # in the middle of the step it is that imposed
+                if wp.static(imposed):  # the attitude in the middle of the step is the imposed one
                     half = real(0.5) * h
                     q = imposed_attitude(m.quad.quat_wb, data, command, k.t0 + half)
                     m.quad.quat_wb = q * rotation_of_vector(q, -half * m.quad.rate_b)
@@ -517,7 +519,7 @@ def build_replay(
                     m.quad.quat_wb = imposed_attitude(q, data, command, k.t1)
                 last = j == count - 1 and until >= end - tiny
                 for e in range(lane, after):
-                    # most steps show nothing, and to ask costs as much as a tenth of a step
+                    # most steps have no stamp, and the call costs a tenth of a step
                     if last or marks[e].due <= k.t1:
                         sensing = sensings[lanes.plant[e]]
                         marks[e] = sampling.sample(

@@ -1,5 +1,5 @@
-"""Launching the replay: parameters, windows, lanes and recorded data as arrays, split over the
-cores of a CPU.
+"""Launch of the replay kernel: arrays of parameters, windows, lanes and recorded data; distribution
+over the cores of a CPU.
 """
 
 import copy
@@ -24,25 +24,26 @@ from sim.params import GRAVITY, PlantParams, SensingParams
 class Replayed:
     """The samples of all lanes.
 
-    With Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro in a lane's window,
-    its first ``2 Nv + Np + Ng`` rows hold: position [m] and attitude against the measured one
-    (rotation vector [rad]) in turns, payload [m], rate [rad/s]. The rest is undefined. ``ends`` and
-    ``knots`` are empty where no lane keeps."""
+    A lane's window has Nv, Np and Ng measured stamps of the vehicle, the payload and the gyro. The
+    first ``2 Nv + Np + Ng`` rows hold, alternately, position [m] and attitude relative to the
+    measured one (rotation vector [rad]), then the payload's position [m], then the rate [rad/s].
+    The other rows are undefined. ``ends`` and ``knots`` are empty if no lane keeps its states."""
 
     samples: ndarray  # shape (rows, lanes, 3)
-    # states at the end of the windows of lanes that keep, as ``starts``; others undefined
+    # states at the end of the windows, fields as in ``starts``; undefined for lanes that do not
+    # keep their states
     ends: dict[str, ndarray]
-    # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+    # fields of KNOT_FIELDS at the knots of lanes that keep their states, in the rows of ``keep``
     knots: dict[str, ndarray]
 
 
 class Recording:
-    """Windows and the flights that they are of, brought to a device once for all runs; the arrays
-    must not change.
+    """Windows and recorded flights, copied to a device once for all runs. The arrays must not
+    change.
     """
 
     def __init__(self, windows: Mapping[str, ndarray], data: Mapping[str, ndarray]):
-        """Keep them.
+        """Create a recording.
 
         Args:
             windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
@@ -63,7 +64,7 @@ class Recording:
 
 
 def still(count: int, segments: int) -> dict[str, ndarray]:
-    """Return states at rest under a rope of so many segments, fields of ``kernel.STATE_FIELDS``."""
+    """Return ``count`` states at rest with a straight rope, fields of ``kernel.STATE_FIELDS``."""
     shapes = {
         "real": (),
         "vec4": (4,),
@@ -81,27 +82,26 @@ def still(count: int, segments: int) -> dict[str, ndarray]:
 
 _BUILDS: dict = {}
 
-PIECES = 4  # of the lanes for each core of a CPU
+PIECES = 4  # launches for each core of a CPU
 
-# lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes
-# some 50 times as long
+# largest number of lanes per core for which a CPU is faster than a GPU, where one lane takes about
+# 50 times as long
 SMALL_BATCH = 32
 
 
 class Replay:
-    """Replays windows of recorded flights with perturbed parameters, initial states and forces.
+    """A replay of windows of recorded flights with perturbed parameters, initial states and forces.
 
-    Raises ValueError: plants of different blocks or segments, or an unphysical parameter.
+    Raises ValueError: plants differ in blocks or segments, or a parameter is unphysical.
 
     Args:
-        plants: parameters of the rows that lanes choose from; one choice of blocks and one number
-            of segments.
-        sensings: of the same rows.
-        device: Warp device, "cpu" or "cuda:0"; with a GPU, runs of few lanes go to the CPU all the
-            same.
+        plants: parameters, one for each row that a lane may select; all with the same kinds of
+            blocks and number of segments.
+        sensings: one for each plant.
+        device: Warp device, "cpu" or "cuda:0"; runs with few lanes use the CPU in any case.
         gravity: [m/s^2].
-        imposed: whether the recording holds the attitudes that the vehicles take, fields of
-            ``kernel.IMPOSED_FIELDS``; commands then are motor speeds.
+        imposed: whether the recording imposes attitudes, fields of ``kernel.IMPOSED_FIELDS``;
+            commands are motor speeds then.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Replay:
         self.segments = first.rope.segments
         self._sim = first.sim
         self._gravity = gravity
-        self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
+        self.types = t = types("float64")  # so that differences between lanes exceed rounding
         check_laws(first.laws, measured=imposed)
         key = (kinds_of(first.vehicle), self.segments, structure(first.laws), imposed)
         if key not in _BUILDS:
@@ -144,14 +144,14 @@ class Replay:
         self._plants: dict[str, list] = {}
 
     def with_rows(self, rows: dict[str, ndarray]) -> "Replay":
-        """Return the same replay with other parameters, structured arrays as in ``rows``."""
+        """Return a copy of the replay with other parameters, structured arrays as in ``rows``."""
         other = copy.copy(self)
         other.rows = rows
         other._plants = {}
         return other
 
     def _plants_on(self, device: str) -> list:
-        """Return plants and sensings on a device, copied once."""
+        """Return plants and sensings on a device, cached."""
         if device not in self._plants:
             rows = dict(self.rows)
             sensings = wp.array(rows.pop("sensings"), dtype=self.kernel.Sensing, device=device)
@@ -167,20 +167,20 @@ class Replay:
         knot_spacing: float,
         knots: int = 1,
     ) -> Replayed:
-        """Fly all lanes.
+        """Simulate all lanes.
 
         Args:
             starts: fields of ``kernel.STATE_FIELDS``, shape (S, ...), rope fields (S, L, ...).
-            recording: what is flown.
+            recording: windows and recorded data.
             lanes: fields of ``kernel.LANE_FIELDS``, shape (lanes,).
-            knot_spacing: between knots of the latent forces [s].
-            knots: rows of the knot arrays.
+            knot_spacing: time between knots of the latent forces [s].
+            knots: number of rows of the knot arrays.
         """
         k = self.kernel
         t = self.types
         count = len(lanes["window"])
         device = self.device if count > SMALL_BATCH * cores() else "cpu"
-        if device != "cpu":  # lanes that wait for others would double the time of the slowest
+        if device != "cpu":  # waiting for the parents would double the time of the slowest lane
             lanes = {**lanes, "resume": np.full(count, -1)}
         w = np.asarray(lanes["window"])
         height = max(int(np.max(recording.rows[w])), 1)
@@ -220,16 +220,16 @@ class Replay:
         return Replayed(out.numpy(), _read(ends, k.State), _read(knot_states, k.Knots))
 
     def _launch(self, device: str, begin: int, costs: ndarray, before: list, after: list) -> None:
-        """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread
-        and leaves the others free.
+        """Launch a part of the lanes: once on a GPU, and in several pieces per core on a CPU, where
+        a launch uses one thread.
 
         Args:
-            device: to launch on.
-            begin: place of the first in the order.
-            costs: of each, in any unit; the longest come first, so that no core is left with one of
-                them in the end.
-            before: arguments that come before the place of the first.
-            after: those that come after it.
+            device: Warp device.
+            begin: index of the first lane in the order.
+            costs: of each lane, in any unit, in descending order, so that no core begins a long
+                lane at the end.
+            before: arguments before the index of the first lane.
+            after: arguments after it.
         """
         if not len(costs):
             return
@@ -242,7 +242,8 @@ class Replay:
         whole = wp.launch(kernel, len(costs), inputs, device="cpu", record_cmd=True)
 
         def launch(first: int, last: int) -> None:
-            # packed once: that of each piece took longer than a lane's flight, with Python held
+            # The arguments are packed once. To pack them for each piece would take longer than a
+            # lane's flight, and with Python's lock held.
             piece = copy.copy(whole)
             piece.params = list(whole.params)
             piece.set_dim(last - first)
@@ -253,12 +254,12 @@ class Replay:
 
 
 def _read(struct: Any, kind: Any) -> dict[str, ndarray]:
-    """Arrays of a struct on the host, lane first."""
+    """Copy the arrays of a struct to the host, with the lane first."""
     return {name: st.fetch(getattr(struct, name)) for name in kind.vars}
 
 
 def _struct(struct: Any, values: Mapping[str, ndarray], device: str) -> Any:
-    """Arrays of the values, float64 or int32, in an instance of a struct."""
+    """Return an instance of a struct with arrays of the values, float64 or int32, on a device."""
     out = struct()
     for name, field in struct.vars.items():
         kind = field.type
@@ -269,7 +270,7 @@ def _struct(struct: Any, values: Mapping[str, ndarray], device: str) -> Any:
 
 
 def _share_out(costs: ndarray, pieces: int) -> list[int]:
-    """Bounds of at most so many runs of lanes that cost about the same, each of at
+    """Return the bounds of at most ``pieces`` ranges of lanes of about equal cost, each with at
     least one lane.
     """
     total = np.cumsum(costs)
@@ -278,8 +279,8 @@ def _share_out(costs: ndarray, pieces: int) -> list[int]:
 
 
 def _lane_order(shared: ndarray, resumed: ndarray) -> tuple[ndarray, ndarray]:
-    """Lanes that fly, those from a start and those that leave another lane on its way; the rest
-    ride along.
+    """Return the lanes to be simulated from a start, and those that continue another lane. The
+    remaining lanes share the flight of another.
     """
     flies = np.ones(len(shared), dtype=bool)
     number = np.arange(len(shared))

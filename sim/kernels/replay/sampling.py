@@ -1,5 +1,5 @@
-"""What measured stamps show of a flight: they lie inside steps, are read from the cubic through
-both ends, and as sensors have it.
+"""Simulated measurements at the recorded stamps: cubic interpolation within a step, and the model
+of the sensors.
 
 Equations of delays, frames and markers: :class:`sim.params.SensingParams`.
 """
@@ -15,7 +15,7 @@ from sim.kernels.structs import Types, make_struct
 
 @wp.func
 def rotation_of_vector(like: Any, vector: Any):
-    """Quaternion (of the type of ``like``) of a rotation vector [rad]."""
+    """Return the quaternion of a rotation vector [rad], of the type of ``like``."""
     angle = wp.length(vector)
     half = type(angle)(0.5) * angle
     scale = type(angle)(0.5)
@@ -26,9 +26,7 @@ def rotation_of_vector(like: Any, vector: Any):
 
 @wp.func
 def vector_of_rotation(like: Any, quat: Any):
-    """Rotation vector [rad] (of the type of ``like``) of a unit quaternion, the shorter
-    way round.
-    """
+    """Return the shortest rotation vector [rad] of a unit quaternion, of the type of ``like``."""
     one = type(quat[3])(1.0)
     sign = one
     if quat[3] < quat[3] - quat[3]:
@@ -43,9 +41,9 @@ def vector_of_rotation(like: Any, quat: Any):
 
 @wp.func
 def cubic(a: Any, rate_a: Any, b: Any, rate_b: Any, s: Any, h: Any):
-    """Cubic through two states, h seconds apart, with their derivatives.
+    """Evaluate the cubic through two states, h seconds apart, with their derivatives.
 
-    ``s``: 0 at the first, 1 at the second."""
+    ``s``: 0 at the first state, 1 at the second."""
     way = b - a
     rest = type(s)(1.0) - s
     return a + way * s + ((rate_a * h - way) * rest - (rate_b * h - way) * s) * (s * rest)
@@ -53,8 +51,8 @@ def cubic(a: Any, rate_a: Any, b: Any, rate_b: Any, s: Any, h: Any):
 
 @wp.func
 def see_pose(x: Any, com: Any, pos_w: Any, quat_wb: Any, reference: Any):
-    """Measured position [m] of the marker body of a vehicle with its centre of mass at ``com``, and
-    its attitude against the quaternion ``reference`` as a rotation vector [rad].
+    """Return the measured position [m] of a vehicle's marker body, and its attitude relative to the
+    quaternion ``reference`` as a rotation vector [rad]; ``com``: centre of mass.
     """
     frame = rotation_of_vector(quat_wb, x.frame_tilt)
     point = pos_w + wp.quat_rotate(quat_wb, x.marker_offset - com)
@@ -65,7 +63,7 @@ def see_pose(x: Any, com: Any, pos_w: Any, quat_wb: Any, reference: Any):
 
 @wp.func
 def see_point(x: Any, like: Any, pos_w: Any):
-    """Measured position of the payload [m]."""
+    """Return the measured position of the payload [m]."""
     frame = rotation_of_vector(like, x.frame_tilt)
     return (type(x.scale)(1.0) + x.scale) * wp.quat_rotate(frame, pos_w + x.payload_offset)
 
@@ -77,17 +75,16 @@ class Sampling:
     sample: wp.Function
     copy_samples: wp.Function
     Moment: type  # a lane in flight
-    Steps: type  # a step's two ends and its length [s], and the lane's state before it
-    # how many stamps of each sensor were sampled, and the time of the state that the next one shows
-    # [s]
+    Steps: type  # start, end and length of a step [s], and the lane's state at its start
+    # number of sampled stamps of each sensor, and time of the state that the next stamp shows [s]
     Pointers: type
 
 
 def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: type) -> Sampling:
-    """Build what a lane does at the end of each step.
+    """Build the functions that a lane calls at the end of each step.
 
     Args:
-        t: types of the wanted precision.
+        t: types of the precision.
         Sensing, Windows, Data, Ball: structs of the replay.
     """
     real = t.real
@@ -104,7 +101,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
 
     @wp.func
     def late(x: Sensing, windows: Windows, w: int, stamp: real, delay: real):
-        """Time of the state that a stamp shows."""
+        """Return the time of the state that a stamp shows [s]."""
         return stamp - delay - x.clock_rate * (stamp - windows.clock_zero[w])
 
     @wp.func
@@ -121,8 +118,8 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
         out: wp.array2d(dtype=vec3),
         lane: int,
     ):
-        """Write every measured stamp that falls into a step; the window's last step samples all
-        that is left.
+        """Write the measurements at all stamps within a step; the window's last step also writes
+        the remaining ones.
         """
         pointers_after = pointers
         pointers_after.due = windows.end[w]
@@ -178,7 +175,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
         lane: int,
         out: wp.array2d(dtype=vec3),
     ):
-        """Copy the samples before a lane departs from another."""
+        """Copy the samples of the parent up to the point at which a lane continues it."""
         vehicles = windows.vehicle_count[w]
         for i in range(2 * pointers.vehicle):
             out[i, lane] = out[i, parent]

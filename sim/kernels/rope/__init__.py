@@ -1,3 +1,1 @@
-"""Rope, payload and release: the chain's recursion, its coupling to the vehicle, and the ballistic
-flight.
-"""
+"""Rope, payload and release: recursion of the chain, coupling to the vehicle, ballistic flight."""

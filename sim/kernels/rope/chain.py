@@ -1,13 +1,13 @@
 """Rope and payload as a chain of slender rods below the vehicle.
 
-The recursion is O(n), with 3x3 matrices, and linearly implicit.
+The recursion is of O(n) with 3x3 matrices, and linearly implicit.
 
-A slender rod on a frictionless universal joint passes a force and no moment. Seen from its upper
-joint, everything below rod i therefore asks for a force ``A a + b`` (A: symmetric apparent mass, a:
-acceleration of the joint). For rod i with direction n (from the upper joint outwards), ``u =
-dn/dt``, length l, mass m, centre of mass c along n, transverse inertia J about the upper joint,
-external force f at its centre, joint couples tau, and ``A, b`` of what hangs at its end, with
-``dn'/dt = beta - |u|^2 n``:
+A slender rod on a frictionless universal joint transmits a force and no moment. So the force at the
+upper joint that accelerates rod i and everything below it is ``A a + b`` (A: symmetric apparent
+mass, a: acceleration of the joint). For rod i with direction n (from the upper joint outwards),
+``u = dn/dt``, length l, mass m, centre of mass c along n, transverse inertia J about the upper
+joint, external force f at its centre, joint couples tau, and ``A, b`` of the chain at its lower
+end, with ``du/dt = beta - |u|^2 n``:
 
     (J I + l^2 P A P) beta = P [g - B a],
         B = c m I + l A,
@@ -16,23 +16,23 @@ external force f at its centre, joint couples tau, and ``A, b`` of what hangs at
 
 where Q is the inverse of the left matrix in the plane normal to n. Each rod is solved in a tangent
 basis (e1, e2) of n: with ``b_k = B e_k`` and the 2x2 inverse q, ``c_k = sum_j q_kj b_j`` gives ``B
-Q B = sum_k b_k c_k^T`` and ``beta = sum_k e_k (h_k - c_k . a)``. Derivation: Newton and Euler for
-one rod about its upper joint (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7, with a 2-dof
-joint that transmits no moment).
+Q B = sum_k b_k c_k^T`` and ``beta = sum_k e_k (h_k - c_k . a)``. Derivation: Newton-Euler equations
+of one rod about its upper joint (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 7, with a
+2-dof joint that transmits no moment).
 
 Time integration (ROS2 of Verwer et al., SIAM J. Sci. Comput. 20, 1999, as a W-method): the Jacobian
-is approximated rod by rod by its geometric stiffness K (tension times arm) and its joint damping D,
-which only adds ``gamma h D + gamma^2 h^2 K`` to J; any approximation keeps second order. With k1
-the first stage, ``n2 = n + h (u + gamma h k1)``, ``u2 = u + h k1`` the predicted state and z the
-solution of the same recursion there, from ``(I - gh J) k2 = f2 - 2 k1`` with ``z = k2 + 2 k1`` and
-gh = gamma h::
+of each rod is approximated by its geometric stiffness K (tension times arm) and its joint damping
+D, which only adds ``gamma h D + gamma^2 h^2 K`` to J. The order is 2 for any approximation. Let k1
+be the first stage, ``n2 = n + h (u + gamma h k1)``, ``u2 = u + h k1`` the predicted state, and z
+the solution of the same recursion there. From ``(I - gh J) k2 = f2 - 2 k1``, with ``z = k2 + 2 k1``
+and gh = gamma h, follow::
 
     u+ = u + h/2 (k1 + z),   n+ = n + h/2 (u + u2 + gamma h (z - k1))
 
-In a rope that gives every rod lengthens with the pull at the mount (equations:
-:class:`sim.params.RopeParams`). With l the length of a rod and l' its growth, its lower end moves
-at ``l u + l' n`` and is accelerated by ``2 l' u`` besides; what hangs there and the rod's own mass
-take part in it."""
+The rods of an elastic rope lengthen with the tension at the mount (equations:
+:class:`sim.params.RopeParams`). With length l of a rod and its rate l', the velocity of the lower
+end relative to the upper one is ``l u + l' n``. The additional (Coriolis) acceleration ``2 l' u``
+acts on the chain below and on the rod's mass."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -45,8 +45,8 @@ from sim.kernels.structs import Types
 
 @wp.func
 def sym_mul(d: Any, o: Any, v: Any):
-    """Product of the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)``
-    and a vector.
+    """Return the product of a vector and the symmetric matrix with diagonal ``d`` and off-diagonals
+    ``o = (xy, xz, yz)``.
     """
     return type(v)(
         d[0] * v[0] + o[0] * v[1] + o[1] * v[2],
@@ -57,7 +57,7 @@ def sym_mul(d: Any, o: Any, v: Any):
 
 @wp.func
 def symmetric(d: Any, o: Any):
-    """Symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)``."""
+    """Return the symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)``."""
     x = type(d)(d[0], o[0], o[1])
     y = type(d)(o[0], d[1], o[2])
     return wp.matrix_from_rows(x, y, type(d)(o[1], o[2], d[2]))
@@ -65,7 +65,9 @@ def symmetric(d: Any, o: Any):
 
 @wp.func
 def tangent_basis(n: Any):
-    """Two unit vectors that complete the unit vector n. Source: Duff et al., JCGT 6(1), 2017."""
+    """Return two unit vectors normal to the unit vector n and to each other.
+
+    Source: Duff et al., JCGT 6(1), 2017."""
     one = type(n[0])(1.0)
     sign = one
     if n[2] < n[2] - n[2]:
@@ -79,12 +81,12 @@ def tangent_basis(n: Any):
 
 @wp.func
 def growing(rope: Any, u: Any):
-    """Coriolis acceleration ``2 l' u`` of the lower end of a rod that lengthens."""
+    """Return the Coriolis acceleration ``2 l' u`` of the lower end of a rod that lengthens."""
     return (type(rope.strain_rate)(2.0) * rope.strain_rate * rope.segment_length) * u
 
 
 def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNamespace:
-    """Build what belongs to one rod: Warp functions of its index, ``segments`` and ``vec2``."""
+    """Return a namespace of Warp functions of a rod's index, ``segments`` and the type ``vec2``."""
     L = segments
     real = t.real
     vec3 = t.vec3
@@ -95,8 +97,8 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
     @wp.func
     def with_load(i: int, part: vec3, arm: real, load: vec3):
-        """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod
-        alone.
+        """Return the force (arm 1) or moment (arm [m]) on rod i; that of the last rod with the
+        force ``load`` on the payload added.
         """
         if wp.static(loaded):
             if i == last:
@@ -105,8 +107,8 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
     @wp.func
     def upper_damping(rope: Rope, i: int):
-        """Damping of the upper joint of rod i [N m s], with the mount's friction in the
-        uppermost.
+        """Return the damping of the upper joint of rod i [N m s]; that of the first includes the
+        mount's friction.
         """
         if wp.static("mount_damping" in extensions):
             if i == 0:
@@ -115,20 +117,20 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
     @wp.func
     def centre_share(rope: Rope, i: int):
-        """Part of a rod's lengthening that its centre of mass follows."""
+        """Return the displacement of a rod's centre of mass per elongation of the rod."""
         if i == last:
             return rope.stretched_share
         return real(0.5)
 
     @wp.func
     def tip(rope: Rope, acc: vec3, u: vec3):
-        """Acceleration of a rod's lower end."""
+        """Return the acceleration of a rod's lower end; ``acc``: without the Coriolis part."""
         return acc + growing(rope, u) if wp.static(giving) else acc
 
     @wp.func
     def rod(rope: Rope, i: int):
-        """Mass, centre along n, transverse inertia about the upper joint of rod i; the last one
-        carries the payload.
+        """Return mass, centre of mass along n, and transverse inertia about the upper joint of rod
+        i; those of the last one include the payload.
         """
         if i == L - 1:
             return rope.last_mass, rope.last_center, rope.last_inertia
@@ -136,7 +138,7 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
     @wp.func
     def below(rope: Rope, i: int):
-        """Mass hanging at the lower joint of rod i [kg]; none at the last one."""
+        """Return the mass below the lower joint of rod i [kg]; 0 for the last one."""
         if i == L - 1:
             return real(0.0)
         return rope.last_mass + real(float(L - 2 - i)) * rope.segment_mass
@@ -154,7 +156,9 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
 
 def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], second: bool):
-    """Build ``up`` of the state or, with ``second``, of the predicted state."""
+    """Build the recursion ``up`` from the last rod to the mount, at the state or, with ``second``,
+    at the predicted state.
+    """
     L = rods.segments
     real = t.real
     vec3 = t.vec3
@@ -197,7 +201,7 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
         ni = direction(n, n2, L - 1)
         ui = rate(u, k1, h, L - 1)
         spin = wp.cross(ni, ui)
-        spin_below = spin  # as if a joint there stood still
+        spin_below = spin  # no friction at the free end
         for step in range(L):
             i = L - 1 - step
             m, c, inertia = rods.rod(rope, i)
@@ -213,7 +217,7 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             if i < L - 1:
                 damping += rope.joint_damping
             speed2 = wp.dot(ui, ui)
-            tip_acc = -(l * speed2) * ni  # of the lower end, beside what a and beta give it
+            tip_acc = -(l * speed2) * ni  # of the lower end, without the parts of a and beta
             f = m * gravity
             cm = c * m
             if wp.static(giving):
@@ -244,7 +248,7 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             inv = real(1.0) / (s11 * s22 - s12 * s12)
             b1 = cm * e1 + l * a_e1
             b2 = cm * e2 + l * a_e2
-            # times the determinant: so neither waits for the division
+            # multiplied by the determinant, so that the division is not waited for
             q1 = s22 * b1 - s12 * b2
             q2 = s11 * b2 - s12 * b1
             g1 = wp.dot(e1, g)
@@ -273,7 +277,9 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
 
 
 def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
-    """Build ``down_first``, ``down_second`` and ``fall_back``, which advance the rods."""
+    """Build ``down_first``, ``down_second`` and ``fall_back``, which advance the rods from the
+    mount to the last one.
+    """
     L = rods.segments
     real = t.real
     vec3 = t.vec3
@@ -284,7 +290,7 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
 
     @wp.func
     def acceleration(ni: vec3, ui: vec3, a: vec3, c1: vec3, c2: vec3, hs: vec2):
-        """du/dt of a rod from the acceleration of its upper joint."""
+        """Return du/dt of a rod from the acceleration of its upper joint."""
         e1, e2 = tangent_basis(ni)
         return e1 * (hs[0] - wp.dot(c1, a)) + e2 * (hs[1] - wp.dot(c2, a)) - wp.dot(ui, ui) * ni
 
@@ -336,8 +342,8 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
         n2: Vectors,
         k1: Vectors,
     ):
-        """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return
-        the new momentum.
+        """Advance n, u and stiffness, and return the new momentum; ``mount_force_w``: force of the
+        vehicle on the chain.
         """
         a = mount_acc_w
         pull = mount_force_w
@@ -376,8 +382,8 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
         n2: Vectors,
         k1: Vectors,
     ):
-        """Advance n and u by the first stage alone, linearly implicit Euler; the
-        stiffness stays.
+        """Advance n and u by the first stage only (linearly implicit Euler), with unchanged
+        stiffness.
         """
         for i in range(L):
             new_u = u[i] + h * k1[i]
@@ -388,22 +394,24 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
 
 
 def build_chain(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNamespace:
-    """Recursion for a fixed number of segments.
+    """Build the recursion for a fixed number of segments.
 
     Args:
-        t: types of the wanted precision.
+        t: types of the precision.
         segments: L.
         extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
 
     Returns:
-        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and
-        force of the whole chain at the mount, at the state and at the predicted state),
-        ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
-        (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
-        alone), ``payload`` (position and velocity of the payload's centre), ``speed`` (that
-        velocity [m/s] as ``k1`` predicts it; k1 is zero before the first stage), ``momentum``
-        (linear momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)``
-        (the rope under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
+        Namespace of Warp functions. ``up_first``, ``up_second`` (last rod to mount: apparent mass
+        and force of the whole chain at the mount, at the state and at the predicted state),
+        ``down_first`` (mount to last rod: first stage k1 and predicted directions n2),
+        ``down_second`` (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the
+        first stage only), ``payload`` (position and velocity of the payload's centre), ``speed``
+        (that velocity [m/s] as predicted by ``k1``, which is zero before the first stage),
+        ``momentum`` and ``com_velocity`` (linear momentum relative to the mount, velocity of the
+        centre of mass), ``pull`` (tension at the mount), ``stretched(natural, before, stiffness, u,
+        h)`` (the rope under its tension; ``before``: the rope h seconds before; h = 0: the length
+        is constant).
     """
     L = segments
     real = t.real
@@ -443,7 +451,7 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNa
 
     @wp.func
     def momentum(rope: Rope, u: Vectors):
-        """Linear momentum [N s] of the chain in a frame that moves with the mount."""
+        """Return the linear momentum [N s] of the chain in a frame that moves with the mount."""
         total = vec3()
         for i in range(L):
             m, c, inertia = rods.rod(rope, i)
@@ -452,16 +460,16 @@ def build_chain(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNa
 
     @wp.func
     def com_velocity(rope: Rope, mount_vel_w: vec3, u: Vectors):
-        """Velocity [m/s] of the centre of mass of rope and payload, world frame."""
+        """Return the velocity [m/s] of the centre of mass of rope and payload, world frame."""
         return mount_vel_w + momentum(rope, u) * (real(1.0) / rope.total_mass)
 
     @wp.func
     def pull(rope: Rope, stiffness: Reals, u: Vectors):
-        """Force [N] along the rope at the mount.
+        """Return the tension [N] at the mount.
 
-        Of many rods from the geometric stiffness of the first (tension times length): half of what
-        that rod itself weighs and swings by is left out. Of a single one what it and the payload
-        weigh, and what keeps them on their circle."""
+        With several rods it follows from the geometric stiffness of the first (tension times
+        length), which neglects half of that rod's weight and centripetal force. With a single rod
+        it is the weight of rod and payload along the rope plus their centripetal force."""
         if wp.static(L > 1):
             return stiffness[0] / rope.segment_length
         else:

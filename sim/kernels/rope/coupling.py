@@ -1,5 +1,5 @@
-"""One integration step of the vehicle with the chain as one body: root solve, ROS2 stages,
-momentum, fall-back.
+"""Integration step of vehicle and chain as one system: root solve, ROS2 stages, momentum,
+fall-back.
 """
 
 from types import SimpleNamespace
@@ -23,8 +23,8 @@ from sim.kernels.structs import Types
 def root(
     p: Any, rope: Any, s: Any, force_b: Any, torque_b: Any, d: Any, o: Any, b: Any, gravity: Any
 ):
-    """Solve for the root's acceleration, given what the chain asks for
-    (``sim.kernels.rope.chain``).
+    """Solve for the vehicle's acceleration, given apparent mass (``d``, ``o``) and force ``b`` of
+    the chain at the mount (``sim.kernels.rope.chain``).
 
     Returns the acceleration of the centre of mass [m/s^2, world], the angular acceleration
     [rad/s^2, body], the acceleration of the mount [world] and the force on the chain [N, world]."""
@@ -56,16 +56,16 @@ def build_coupled_step(
     integrator: str = "heun",
     hanging=hanging_force,
 ):
-    """One step of h seconds of vehicle and chain.
+    """Build a step of h seconds of vehicle and chain.
 
-    The vehicle advances by Heun's method, the chain by ROS2, both from the same two solves. The
-    velocity of the root follows from the total linear momentum, which external forces alone change;
-    so it is conserved to round-off. Where a rod turns more than ``max_turn`` in the step, the first
-    stage alone (linearly implicit Euler) is kept. Returns a namespace of Warp functions ``step``
-    (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in
-    place), ``step_alone`` (the vehicle without the rope, by the ``integrator``), ``momentum``
-    (total linear momentum [N s]) and ``payload`` (position and velocity of its centre, world
-    frame)."""
+    The vehicle advances by Heun's method and the chain by ROS2, both from the same two solves. The
+    vehicle's velocity follows from the total linear momentum, which only external forces change. So
+    momentum is conserved to round-off. If a rod turns by more than ``max_turn`` in the step, only
+    the first stage (linearly implicit Euler) is used. Returns a namespace of Warp functions
+    ``step`` (new state, new total momentum, whether it fell back to the first stage; the arrays n,
+    u and stiffness change in place), ``step_alone`` (the vehicle without the rope, by the
+    ``integrator``), ``momentum`` (total linear momentum [N s]) and ``payload`` (position and
+    velocity of its centre, world frame). ``hanging``: function of the force on the payload."""
     vec3 = t.vec3
     Vectors = t.Vectors
     real = t.real
@@ -92,7 +92,7 @@ def build_coupled_step(
         k1: Vectors,
         h: real,
     ):
-        """Force on the payload [N], world frame."""
+        """Return the force on the payload [N], world frame."""
         if wp.static(loaded):
             jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
             vel = chain.speed(rope, mount_velocity(rope, s), u, k1, h)
@@ -110,15 +110,15 @@ def build_coupled_step(
 
     @wp.func
     def root_velocity(p: Vehicle, rope: Rope, s: QuadState, total: vec3, relative: vec3):
-        """Velocity of the vehicle from the total momentum and the chain's own relative to the
-        mount.
+        """Return the velocity of the vehicle from the total momentum and the chain's momentum
+        relative to the mount.
         """
         turn = wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
         return (total - rope.total_mass * turn - relative) / (p.body.mass + rope.total_mass)
 
     @wp.func
     def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
-        """Couple of the uppermost joint on the vehicle [N m], body frame."""
+        """Return the torque of the uppermost joint on the vehicle [N m], body frame."""
         damping = rope.joint_damping + rope.mount_damping
         return damping * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
 

@@ -1,4 +1,4 @@
-"""Rope and payload in free flight after the release: the chain of :mod:`sim.kernels.rope.chain`
+"""Free flight of rope and payload after the release: the chain of :mod:`sim.kernels.rope.chain`
 without a vehicle.
 """
 
@@ -14,10 +14,10 @@ from sim.kernels.structs import Types, make_struct
 
 
 def build_loose_step(t: Types, chain):
-    """One ROS2 step of a rope that nothing holds.
+    """Build a ROS2 step of a rope whose upper end is free.
 
-    The root's acceleration a follows from ``A a + b = 0``: nothing pulls at the upper end. As in
-    the coupled step the root's velocity follows from the total momentum. Returns a Warp function
+    The acceleration a of the upper end follows from ``A a + b = 0``, as no force acts there. As in
+    the coupled step, its velocity follows from the total momentum. Returns a Warp function
     ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity, gamma, max_turn, h)`` -> position and
     velocity of the upper end; the arrays n, u and stiffness change in place."""
     vec3 = t.vec3
@@ -52,7 +52,7 @@ def build_loose_step(t: Types, chain):
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
         load1 = free_force(rope, air, chain.speed(rope, vel_w, u, k1, h))
-        # a root that turns with the first rod rubs on nothing
+        # an upper end that turns with the first rod has no friction
         d, o, b = chain.up_first(
             rope,
             n,
@@ -97,13 +97,13 @@ def build_loose(
     chain: SimpleNamespace,
     laws: SimpleNamespace,
 ) -> SimpleNamespace:
-    """Build the flight of a payload and of a rope that may leave with it, all extensions built in.
+    """Build the flight of a payload, and of a rope that may leave with it, with all extensions.
 
-    Returns a namespace of the struct ``Ball`` and of the Warp functions
-    ``let_go(r, rope, quad, n, u)`` -> ball at the separation,
-    ``hang_below(rope, pos, vel, n, u)`` -> ball with a rope in line,
-    ``fly(ball, rope, r, air, n, u, stiffness, gravity, gamma, max_turn, h)`` -> ball after h
-    seconds, and ``payload(r, ball)`` -> its position and velocity, with the rope's share."""
+    Returns a namespace of the struct ``Ball`` (payload alone, and rope with payload) and of Warp
+    functions: ``let_go(r, rope, quad, n, u)`` -> ball at the separation; ``hang_below(rope, pos,
+    vel, n, u)`` -> ball with a payload at this position and velocity; ``fly(ball, rope, r, air, n,
+    u, stiffness, gravity, gamma, max_turn, h)`` -> ball after h seconds; ``payload(r, ball)`` ->
+    position and velocity of the payload, a mean of both weighted by ``rope_tail``."""
     vec3 = t.vec3
     real = t.real
     Vectors = t.Vectors

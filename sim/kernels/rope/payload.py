@@ -1,4 +1,4 @@
-"""Forces on the payload besides its weight and the rope.
+"""Forces on the payload other than weight and rope.
 
 Equations: :class:`sim.params.RopeParams`.
 """
@@ -10,21 +10,21 @@ import warp as wp
 
 from sim.kernels.structs import Types
 
-# extensions that push at the payload
+# extensions with a force on the payload
 LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
 
 
 @wp.func
 def drag(rope: Any, air: Any, vel_w: Any):
-    """Drag of the payload [N]."""
+    """Return the drag of the payload [N], world frame."""
     air_vel_w = vel_w - air.wind_w
     return -(rope.payload_drag * wp.length(air_vel_w)) * air_vel_w
 
 
 @wp.func
 def hanging_force(rope: Any, air: Any, vel_w: Any, along_w: Any, jet_w: Any):
-    """Force [N] on a payload on the rope, whose last segment has the direction ``along_w``;
-    ``jet_w``: of the rotors on the air [N].
+    """Return the force [N] on a payload on the rope; ``along_w``: direction of the last segment;
+    ``jet_w``: force of the rotors on the air [N].
     """
     force = drag(rope, air, vel_w) + air.payload_push_w
     force -= rope.swing_damping * (vel_w - wp.dot(vel_w, along_w) * along_w)
@@ -33,7 +33,7 @@ def hanging_force(rope: Any, air: Any, vel_w: Any, along_w: Any, jet_w: Any):
 
 @wp.func
 def free_force(rope: Any, air: Any, vel_w: Any):
-    """Force [N] on a payload in flight, with the side force and lift of one that spins."""
+    """Return the force [N] on a payload in flight, with side force and lift due to its spin."""
     air_vel_w = vel_w - air.wind_w
     side = type(vel_w)(-air_vel_w[1], air_vel_w[0], air_vel_w[0] - air_vel_w[0])
     lift = wp.cross(air_vel_w, wp.normalize(side))
@@ -42,8 +42,8 @@ def free_force(rope: Any, air: Any, vel_w: Any):
 
 
 def build_flight(t: Types, laws: SimpleNamespace):
-    """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws
-    on it included.
+    """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, which
+    includes the laws.
     """
 
     @wp.func

@@ -11,21 +11,20 @@ import warp as wp
 from sim.kernels.structs import Types
 
 FLIGHT_STEP = 0.02
-"""Largest step of a flight under drag [s]:
-
-RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it).
+"""Largest step of a flight with drag [s]. After one second, the error of a tennis ball's path by
+RK4 is 1e-8 m (tested).
 """
-# steps after which a payload that has not come down counts as one that never will
+# largest number of steps until the landing
 FLIGHT_STEPS = 500
 
 
 @wp.func
 def time_to_height(rope: Any, air: Any, pos_w: Any, vel_w: Any, height: Any, gravity: Any):
-    """Time [s] at which a projectile comes down to ``height`` [m]; 0 where it never reaches it;
-    ``gravity``: magnitude [m/s^2].
+    """Return the time [s] at which a projectile descends to ``height`` [m]; ``gravity``: magnitude
+    [m/s^2].
 
-    Neither rope nor air counts in this module's functions; under drag they do
-    (:func:`build_ballistic`)."""
+    If it never reaches the height, the result is the time of its apex, at least 0. ``rope`` and
+    ``air`` are not used here, but by the functions with drag (:func:`build_ballistic`)."""
     zero = height - height
     two = type(height)(2.0)
     root = wp.max(vel_w[2] * vel_w[2] + two * gravity * (pos_w[2] - height), zero)
@@ -34,7 +33,7 @@ def time_to_height(rope: Any, air: Any, pos_w: Any, vel_w: Any, height: Any, gra
 
 @wp.func
 def projectile(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity: Any, time: Any):
-    """Position [m] after ``time`` of free flight, world frame, z up."""
+    """Return the position [m] after ``time`` [s] of free flight, world frame, z up."""
     fall = type(time)(0.5) * gravity * time * time
     return pos_w + time * vel_w - type(pos_w)(time - time, time - time, fall)
 
@@ -50,8 +49,8 @@ def clearance(
     vehicle_w: Any,
     samples: int,
 ):
-    """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from
-    0 to 1.
+    """Return the smallest distance [m] from a point, at ``samples`` equally spaced times from 0 to
+    ``time``.
     """
     nearest = wp.length(pos_w - vehicle_w)
     for k in range(1, samples):
@@ -64,21 +63,23 @@ def clearance(
 
 @wp.func
 def lag(r: Any, rope: Any, pull: Any, gravity: Any):
-    """Time [s] from the latch to the separation, by the rope's pull at the latch [N]."""
+    """Return the time [s] from the latch to the separation; ``pull``: tension at the latch [N]."""
     excess = pull - rope.payload_mass * gravity
     return wp.max(r.lag + r.lag_tension * excess, gravity - gravity)
 
 
 @wp.func
 def kick(r: Any, vel_w: Any, along_w: Any):
-    """Velocity of the payload after the release, with the last segment's direction."""
+    """Return the velocity of the payload after the release; ``along_w``: direction of the last
+    segment.
+    """
     return vel_w + r.kick_w + r.kick_along * along_w
 
 
 @wp.func
 def tail(r: Any, vel_w: Any, com_vel_w: Any):
-    """Velocity of a payload that takes a share of the rope with it, with that of the centre of mass
-    of both.
+    """Return the velocity of a payload that leaves with a share of the rope; ``com_vel_w``: of the
+    centre of mass of rope and payload.
     """
     return vel_w + r.rope_tail * (com_vel_w - vel_w)
 
@@ -88,7 +89,7 @@ def build_step_in_flight(t: Types, acceleration):
     alone after h seconds, by RK4.
 
     Args:
-        t: types of the wanted precision.
+        t: types of the precision.
         acceleration: ``(rope, air, vel_w, gravity_w)`` -> [m/s^2], world frame.
     """
     real = t.real
@@ -113,12 +114,12 @@ def build_step_in_flight(t: Types, acceleration):
 
 
 def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
-    """Flight of the payload alone: in closed form in still, thin air, by RK4 under drag.
+    """Build the flight of the payload alone: in closed form, or by RK4 with forces of the air.
 
     Args:
-        t: types of the wanted precision.
+        t: types of the precision.
         acceleration: ``(rope, air, vel_w, gravity)`` -> [m/s^2], world frame.
-        dragging: whether the air counts.
+        dragging: whether the air acts on the payload.
 
     Returns:
         Namespace of Warp functions ``time_to_height(rope, air, pos, vel, height, gravity)`` [s],
@@ -150,7 +151,9 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
 
     @wp.func
     def drag_time(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, height: real, gravity: real):
-        """Steps until the height is passed, then Newton's method from the last step's start."""
+        """Step until the height is passed, then use Newton's method from the start of the last
+        step.
+        """
         pos = pos_w
         vel = vel_w
         h = real(FLIGHT_STEP)
