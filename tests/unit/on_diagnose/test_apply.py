@@ -109,7 +109,7 @@ def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_
     alone = diagnosis(theta={"battery_charge": 0.04}, covariance=[[1e-4]])
     output = printed(f"diagnose apply {alone} --out {tmp_path}/none.toml")
     assert "Not written: battery_charge" in output
-    assert "the configuration stands as it is" in output
+    assert "the configuration is unchanged" in output
     assert not (tmp_path / "none.toml").exists()
 
 

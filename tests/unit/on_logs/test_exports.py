@@ -251,7 +251,7 @@ QUESTIONS = {
     "gyro.x,gyro.y,gyro.z,acc.x,acc.y,acc.z": "rad/s or deg/s",
     "omega_x,omega_y,omega_z,acc_x,acc_y,acc_z": "rad/s or deg/s",
     "controller.r_roll,controller.r_pitch,controller.r_yaw,a,b,c": "body rates",
-    "ctrl.roll,ctrl.pitch,ctrl.yaw,a,b,c": "angles, as taken, or body rates",
+    "ctrl.roll,ctrl.pitch,ctrl.yaw,a,b,c": "angles, as assumed, or body rates",
 }
 
 

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
         hint = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         what = "configuration" if of_throw else "setup"
         law = hint if saved.report.get("explanations") else ""
-        print(f"nothing to write{law}; the {what} stands as it is")
+        print(f"nothing to write{law}; the {what} is unchanged")
         return 0
     if not args.anyway:
         saved.refuse_denied()

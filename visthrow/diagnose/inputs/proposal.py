@@ -162,8 +162,8 @@ def _clock(
     if name is None:
         count = max(map(len, numbers.values()))
         proposal.questions.append(
-            "no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is"
-            " a guess"
+            "no column rises like a clock: how far are the rows apart? row_period = 0.01 [s] is a"
+            " guess"
         )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     steps = np.diff(numbers[name])
@@ -207,7 +207,7 @@ def _correct(table: Table, source: str, proposal: MappingProposal) -> FlightLog:
         turned = replace(proposal.mapping.entry("rate_b"), axes=turns[0].figures["axes"])
         proposal.mapping = proposal.mapping.with_entry(turned)
         proposal.why["rate_b"] += f"; axes by physics: {turns[0].text}"
-    proposal.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
+    proposal.questions += [f"{row.channel} contradicts physics: {row.text}" for row in wrong]
     return log
 
 
@@ -241,7 +241,7 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
         if not named:
             listed = ", ".join(f"{mass:.3g} kg in {unit}" for unit, mass in masses.items())
             proposal.questions.append(
-                f"{thrust}: newtons of all motors together, as taken? It carries {listed}"
+                f"{thrust}: in newtons for all motors together, as assumed? It carries {listed}"
             )
         return
     unit = find_unit_by_mass(one, weighed, units)
@@ -312,7 +312,7 @@ def _find_input(log: FlightLog, proposal: MappingProposal) -> str:
         return ""
     question = f"which of {', '.join(inputs)} drives the vehicle?"
     if not scores:
-        proposal.questions.append(f"{question} The force says nothing; '{inputs[0]}' is taken")
+        proposal.questions.append(f"{question} The force does not tell; '{inputs[0]}' is assumed")
         return ""
     best = max(scores, key=scores.__getitem__)
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
@@ -345,7 +345,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     whole = weighed / share if weighed else mass or 1.0
     hanging = (1.0 - share) * whole
     if weighed is None:
-        why = "stands for any, and the thrust is scaled to it"
+        why = "is a placeholder, to which the thrust is scaled"
         why = "is what its thrust carries" if mass else why
         proposal.questions.append(
             f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG"

@@ -178,8 +178,8 @@ class Recognition:
             why = f"{words} up to {group.reach:.3g} {unit}"
             if self._take("quat_wb", group, unit, why, kind=kind) and vector:
                 self.questions.append(
-                    f"are {group.listed} a rotation vector (Vicon's angle-axis), as taken, or roll,"
-                    ' pitch and yaw (kind = "euler")?'
+                    f"are {group.listed} a rotation vector (Vicon's angle-axis), as assumed, or"
+                    ' roll, pitch and yaw (kind = "euler")?'
                 )
 
     def _attitudes(self) -> list[Attitude]:
@@ -242,12 +242,12 @@ class Recognition:
         if not groups and unnamed:  # no name hints at a position
             groups = unnamed
             listed = "; ".join(group.listed for group in groups)
-            self.questions.append(f"are these positions? Names do not say: {listed}")
+            self.questions.append(f"are these positions? Their names do not tell: {listed}")
         slopes = groups + [g for g in smooth if g.hints_at("velocity")]
         groups = self._drop_derivatives(groups, slopes)
         for group in [g for g in groups if g.matches("camera")]:
             unit = readings(self.time, group.values, _lengths(group), [NO_ATTITUDE])[0].unit
-            why = "three columns that move smoothly; their name speaks of a camera"
+            why = "three columns that move smoothly, named after a camera"
             self._take("marker_pos_c", group, unit, why)
         paths = self._paths([g for g in groups if not g.matches("camera")])
         pay = self._payload(paths, unnamed)
@@ -355,7 +355,7 @@ class Recognition:
         if best is not None:
             return best[1:]
         if len(paths) == 1 and PATTERNS["not_vehicle"].search(" ".join(paths[0].group.columns)):
-            return None, paths[0], "the only path, and its name speaks of no vehicle"
+            return None, paths[0], "the only path, whose name is not of a vehicle"
         return None
 
     def _smooth(self, group: Group) -> bool:
@@ -461,11 +461,11 @@ class Recognition:
         if score > _BELONGS:
             times = _size(self._samples(group)) / max(_size(derived), 1e-6)
             unit = "deg/s" if times > 7.0 else "rad/s"
-            why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
+            why = f"the rates of the attitude, correlation {score:.2f}, ratio {times:.3g}"
         elif not group.unit:
             self.questions.append(
-                f"are the rates {group.listed} in rad/s or deg/s? '{unit}' is taken: no attitude"
-                " says"
+                f"are the rates {group.listed} in rad/s or deg/s? '{unit}' is assumed, without an"
+                " attitude to compare with"
             )
         self._take("rate_b", group, unit, why, axes=self._body())
 
@@ -473,7 +473,7 @@ class Recognition:
         for group in self._find_hints("acc_b"):
             size = np.nanmedian(np.linalg.norm(group.values, axis=1))
             for unit in fitting_units(size / physics.GRAVITY, ("m/s^2", "g", "mg"), 0.8, 1.25):
-                why = f"a middle size of {size:.3g}: gravity in {unit}"
+                why = f"a median norm of {size:.3g}: gravity in {unit}"
                 self._take("acc_b", group, unit, why, axes=self._body())
 
     def _motors(self) -> None:
@@ -496,7 +496,7 @@ class Recognition:
             turning = group.values[group.values > 0.0]
             pulses = high < _LARGEST_PULSE and len(turning) > 0
             if pulses and np.percentile(turning, 1) > _LEAST_PULSE:
-                why += f": pulses in us, {IDLE_PULSE:.0f} for a motor that stands"
+                why += f": pulses in us, {IDLE_PULSE:.0f} for a stopped motor"
                 offset = -IDLE_PULSE
             if self._take("motor_command", group, unit, why, offset=offset):
                 self.questions.append(
@@ -509,14 +509,14 @@ class Recognition:
             if group.matches("battery"):
                 units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
                 for unit in fitting_units(group.middle, units, *_PACK):
-                    why = f"a middle of {group.middle:.4g}: a pack in {unit}"
+                    why = f"a median of {group.middle:.4g}: a battery in {unit}"
                     self._take("battery_voltage", group, unit, why)
             elif group.matches("angle") and "quat_wb" not in self._found:
                 unit = _angle_unit(group)
-                why = f"an angle, by its name; a middle of {group.middle:.3g}"
+                why = f"an angle, by its name; a median of {group.middle:.3g}"
                 if self._take("angle", group, unit, why) and not group.unit:
                     self.questions.append(
-                        f"angle '{group.stem}': '{unit}' is taken by its reach: deg or rad?"
+                        f"angle '{group.stem}': deg or rad? '{unit}' is assumed, by its range"
                     )
 
     def _thrust(self) -> None:
@@ -531,7 +531,7 @@ class Recognition:
         for group in groups:
             if group.middle <= _LARGEST_THRUST and not rises(group.values[:, 0]):
                 unit = group.unit if group.unit in THRUSTS else "N"
-                self._take("thrust_command", group, unit, f"a middle of {group.middle:.4g}")
+                self._take("thrust_command", group, unit, f"a median of {group.middle:.4g}")
 
     def _ask_what_is_open(self) -> None:
         known = self._found.keys()
@@ -539,18 +539,18 @@ class Recognition:
         outputs = [c for c in columns if PATTERNS["motor"].match(split_unit(c)[0])]
         if len(outputs) > 4 and not known & {"motor_command", "motor_speed"}:
             self.questions.append(
-                f"which four of {', '.join(outputs)} are the motors? None is taken"
+                f"which four of {', '.join(outputs)} are the motors? None is used"
             )
         if "quat_wb" in known and not known & {"pos_w", "rate_b"}:
             attitude = self._found["quat_wb"]
             if attitude.entry.kind == "euler" and not attitude.group.unit:
                 self.questions.append(
-                    f"are {attitude.group.listed} angles, as taken, or body rates? Nothing in the"
-                    " motion says"
+                    f"are {attitude.group.listed} angles, as assumed, or body rates? The motion"
+                    " does not tell"
                 )
         if "pos_w" in known and not known & _MOTIONS:
             self.questions.append(
-                "nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w"
+                "only pos_w moves: if it is a payload or a ball, rename it to payload_pos_w"
             )
         for group in [g for g in self._open(1) if g.matches("split")]:
             values = np.unique(group.values[np.isfinite(group.values)])

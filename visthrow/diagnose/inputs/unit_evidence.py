@@ -140,7 +140,7 @@ def readings(
             if leaning and lean.times > 0.0:
                 times = UNITS[unit][1] * lean.times
                 doubt += _huber(max(0.0, abs(np.log(times)) - slack) / _SCATTER)
-                why = f"{unit} by gravity: it accelerates by {times:.2g} times what its lean makes"
+                why = f"{unit} by gravity: its acceleration is {times:.2g} times that by its tilt"
             elif fall:
                 why = f"{unit} by gravity: a part of it falls freely"
             listed.append(PathReading(unit, attitude, doubt, why))
