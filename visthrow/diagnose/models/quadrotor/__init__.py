@@ -1,1 +1,3 @@
-"""A quadrotor that its logged commands drive: with a measured pose, or with an IMU alone."""
+"""Models of a quadrotor driven by its logged commands: with a measured pose, or with an IMU
+alone.
+"""

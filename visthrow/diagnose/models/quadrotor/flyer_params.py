@@ -123,7 +123,8 @@ class FlyerParams(QuadrotorParams):
         super().__post_init__()
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
             raise ConfigError(
-                f"torque with the input '{self.input}'; expected motor_command or motor_speed"
+                f"torque with the input '{self.input}'; expected commands of single motors:"
+                " motor_command or motor_speed"
             )
         if self.torque is not None and self.cable is not None and any(self.cable.mount):
             raise ConfigError(
