@@ -1,7 +1,7 @@
-"""Back-ends: where commands go.
+"""Back-ends, which send commands to the vehicle.
 
-``dry-run`` (the default) sends nothing, ``ardupilot`` and ``px4`` speak MAVLink on the link that
-the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own.
+``dry-run`` (the default) sends nothing; ``ardupilot`` and ``px4`` use MAVLink on a link that may
+also carry the poses; ``betaflight`` uses MSP and ``crazyflie`` CRTP on a separate port.
 """
 
 from pathlib import Path
@@ -23,15 +23,12 @@ from visthrow.onboard.hover import GRAVITY
 
 # back-ends that speak MAVLink
 AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {"ardupilot": ArduPilot, "px4": Px4}
-# shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must
-# reach at least
+# share of the trained maximum thrust, and of the trained maximum rates, that a vehicle must reach
 THRUST_SHORT = 0.98
 
 
 def mechanism_lag(params: Any) -> float:
-    """Return the time from the release command to separation [s] of the mechanism of a run's
-    back-end; 0 for a dry run.
-    """
+    """Return the mechanism's time from release command to separation [s]; 0 for a dry run."""
     return 0.0 if params.vehicle is None else params.vehicle.mechanism_lag
 
 
@@ -42,15 +39,14 @@ def make_backend(
     tell: Announce = None,
     folder: Path | None = None,
 ) -> Backend | Held:
-    """Return the back-end of a run; raises `LinkError` or `RunError` where there is no link or port
-    for it.
+    """Return the back-end of a run. Raises `LinkError` or `RunError`: there is no link or port for
+    it.
 
     Args:
-        params: `hil.params.HilParams`. link: MAVLink link of the run; None where poses are recorded
-            ones.
-        write: whether wrong parameters of the autopilot are written. tell: is handed the audit's
+        params: `hil.params.HilParams`. link: MAVLink link of the run; None for recorded poses.
+        write: whether to correct wrong parameters of the autopilot. tell: called with the audit's
             table.
-        folder: of the run, where MSP is written down as the link's messages are in its .tlog.
+        folder: of the run, in which the MSP traffic is recorded.
     """
     name = params.backend
     vehicle = params.vehicle
@@ -78,8 +74,9 @@ def make_backend(
 
 
 def require_reach(params: Any, contract: dict[str, Any]) -> None:
-    """Raise `RunError` for a vehicle that by its configuration is not the policy's: another weight,
-    or a calibration and rate profile that do not reach what the policy was trained to command.
+    """Raise `RunError` for a vehicle whose configuration does not match the policy: another
+    weight, or a thrust calibration or rate profile that does not reach the policy's largest
+    commands.
     """
     vehicle = params.vehicle
     if vehicle is None:

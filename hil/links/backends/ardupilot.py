@@ -3,11 +3,11 @@
 SET_ATTITUDE_TARGET in GUIDED or GUIDED_NOGPS, DO_GRIPPER or DO_SET_SERVO, LOITER or BRAKE to hold,
 LAND.
 
-Without bit 3 of GUID_OPTIONS thrust is read as a climb rate; with ATC_ANGLE_BOOST it grows with
-tilt; DO_SET_SERVO is accepted on an output that has a function and moves nothing; the last
-set-point is flown until GUID_TIMEOUT.
+Without bit 3 of GUID_OPTIONS, thrust is interpreted as a climb rate. With ATC_ANGLE_BOOST, thrust
+grows with tilt. DO_SET_SERVO is accepted for an output that has a function, but moves nothing. The
+last set-point is flown until GUID_TIMEOUT.
 
-A gripper closes at GRIP_GRAB and opens at GRIP_RELEASE, which by default is the lower one.
+A gripper closes at GRIP_GRAB and opens at GRIP_RELEASE, which is the lower value by default.
 
 Source: `hil.links.facts`, ardupilot.toml."""
 
@@ -30,10 +30,10 @@ SERVO_GRIPPER = FACTS["gripper_function"]
 
 @dataclass(frozen=True)
 class ArduPilotParams(AutopilotParams):
-    """The vehicle on the other side."""
+    """Settings of an ArduPilot vehicle."""
 
     follow_mode: int  # GUIDED (4) or GUIDED_NOGPS (20)
-    hold_mode: int  # LOITER (5) or BRAKE (17): who holds after the throw
+    hold_mode: int  # LOITER (5) or BRAKE (17), after the throw
     release: Literal["gripper", "servo"]  # DO_GRIPPER, or DO_SET_SERVO on servo_output
     gripper: int  # number of the gripper
 
@@ -51,7 +51,7 @@ class ArduPilotParams(AutopilotParams):
 
 
 class ArduPilot(MavlinkAutopilot):
-    """An ArduCopter."""
+    """The back-end of an ArduCopter."""
 
     name = "ardupilot"
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA

@@ -1,5 +1,5 @@
-"""Audit of an autopilot's parameters at connect, whose rules each back-end holds; a mismatch
-refuses to fly, and nothing is written unless the operator said so.
+"""Audit of an autopilot's parameters when it connects. A mismatch with the back-end's rules
+prevents the flight; parameters are written only if the operator requests it.
 """
 
 import math
@@ -11,39 +11,39 @@ from hil.links.facts import values
 from hil.links.roster import Announce
 from visthrow.common.toml_text import tables_beside
 
-ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
-# after a value was written, answers may still be on their way that were given before; then it is
-# read back [s]
+ASK_AGAIN = 0.2  # between two requests for a missing value [s]
+# after a write, during which outdated answers may still arrive; then the value is read back [s]
 SETTLE = 0.5
-GIVE_UP = 5.0  # a value that has not come within this time is missing [s]
-GIVE_UP_OPTIONAL = 1.0  # likewise one that not all firmware has [s]
+GIVE_UP = 5.0  # time after which a value counts as missing [s]
+GIVE_UP_OPTIONAL = 1.0  # likewise for a value that not all firmware has [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 ROUNDING = 1e-6  # tolerance of values
 RULES = tables_beside(__file__, "rules.toml")
-MOST_NAMED = 4  # parameters that a fault names; the table has all
+MOST_NAMED = 4  # parameters named in a fault; the table has all
 
 
 @dataclass(frozen=True)
 class Rule:
-    """The required value of one parameter; all that is stated must hold."""
+    """The requirements on the value of one parameter; all of them must hold."""
 
     name: str
     why: str
     values: tuple[float, ...] = ()  # one of these
-    tolerance: float = 0.0  # of them; 0: rounding
+    tolerance: float = 0.0  # of these values; 0: rounding only
     mask: int = 0  # bits that must be set
     above: float = -math.inf
     below: float = math.inf
     minimum: float = -math.inf
     maximum: float = math.inf
-    expected: str = ""  # in words; "": the value, or the bits
-    # write the bits, the first of the values, or the maximum, where the operator asked for it
+    expected: str = ""  # text for the table; "": the value, or the bits
+    # whether the bits, the first of the values, or the maximum may be written on the operator's
+    # request
     write: bool = False
-    optional: bool = False  # firmware without it is right as well
-    warns: bool = False  # a mismatch is reported, and flown with
+    optional: bool = False  # whether firmware may lack the parameter
+    warns: bool = False  # whether a mismatch is only reported
 
     def good(self, value: float) -> bool:
-        """Return whether a value is as required."""
+        """Return whether a value meets the requirements."""
         equal = not self.values or any(
             abs(value - x) <= (self.tolerance or ROUNDING * max(1.0, abs(x))) for x in self.values
         )
@@ -52,19 +52,19 @@ class Rule:
         return equal and in_range and (not self.mask or int(value) & self.mask == self.mask)
 
     def correct(self, value: float) -> float:
-        """Return what is written in place of a value."""
+        """Return the correct value to write in place of a wrong one."""
         return int(value) | self.mask if self.mask else (*self.values, self.maximum)[0]
 
     @property
     def words(self) -> str:
-        """The expected value in words."""
+        """Text of the expected value."""
         exact = f"{self.values[0]:g}" if self.values else f"with the bits of {self.mask} set"
         return self.expected or exact
 
 
 def rules_of(firmware: str, params: Any, **further: Any) -> list[Rule]:
-    """Return the rules of ``rules.toml`` for a firmware by its facts, the vehicle's configuration
-    and further values.
+    """Return a firmware's rules from ``rules.toml``, filled in from its facts, the vehicle's
+    configuration and further values.
     """
     terms = values(firmware) | vars(params) | further
     rules = []
@@ -78,7 +78,7 @@ def rules_of(firmware: str, params: Any, **further: Any) -> list[Rule]:
 
 
 def _fill(key: str, entry: Any, terms: dict[str, Any]) -> Any:
-    """Return an entry of a row with the terms that it names."""
+    """Return an entry of a row with the values of the terms that it names."""
     if isinstance(entry, list):
         return tuple(_fill(key, value, terms) for value in entry)
     if isinstance(entry, str):
@@ -87,12 +87,12 @@ def _fill(key: str, entry: Any, terms: dict[str, Any]) -> Any:
 
 
 class Audit:
-    """Asks for parameters one by one and judges them.
+    """Reads an autopilot's parameters and checks them against rules.
 
     Attributes:
-        found: values by name. refused: why a value did not come, by name. written: names that were
-            changed.
-        problems: mismatches in words, once the audit is done.
+        found: values by name. refused: by name, why a value was not delivered. written: names of
+            changed parameters.
+        problems: texts of the mismatches, once the audit is done.
     """
 
     def __init__(
@@ -102,10 +102,10 @@ class Audit:
         write: Callable[[str, float], None] | None = None,
         tell: Announce = None,
     ):
-        """Begin with nothing asked; without rules the audit is done.
+        """Start before the first request; without rules the audit is done at once.
 
-        ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever
-        written), ``tell`` is handed the table, once."""
+        ``ask`` requests a parameter, ``write`` sends a new value (None: never write), ``tell`` is
+        called once with the table."""
         self.rules = {rule.name: rule for rule in rules}
         self._ask = ask
         self._write = write
@@ -121,14 +121,14 @@ class Audit:
         self.problems: list[str] = []
 
     def refuse(self, name: str, error: int) -> None:
-        """Take an answer that there is no value: a MAV_PARAM_ERROR."""
+        """Process an error in place of a value: a MAV_PARAM_ERROR."""
         if not self.done and name in self.rules:
             self.refused[name] = (
                 "no such parameter" if error == NO_SUCH_PARAMETER else f"refused with error {error}"
             )
 
     def feed(self, name: str, value: float) -> None:
-        """Take an answer."""
+        """Process an answer; a wrong value that may be written is corrected."""
         rule = self.rules.get(name)
         if self.done or rule is None or self._is_settling(name):
             return
@@ -137,14 +137,14 @@ class Audit:
         if writes and not rule.good(value):
             self.written.append(name)
             self._written_at[name] = self._now
-            del self.found[name]  # it counts when it was read back
+            del self.found[name]  # counts only once it is read back
             self._write(name, rule.correct(value))
 
     def _is_settling(self, name: str) -> bool:
         return self._now - self._written_at.get(name, -1e9) < SETTLE
 
     def service(self, host_time: float) -> None:
-        """Ask for what is missing."""
+        """Request missing values; finish when all have arrived or the time is over."""
         self._now = host_time
         if self.done:
             return
@@ -181,7 +181,7 @@ class Audit:
         ]
 
     def fault(self) -> str | None:
-        """Return what ends the run, in short; the table has it in full."""
+        """Return a short text of the fault that ends the run; the table has all mismatches."""
         if not self.problems:
             return None
         names = [rule.name for rule in self._wrong() if not rule.warns]
@@ -191,7 +191,9 @@ class Audit:
         )
 
     def table(self) -> str:
-        """Return parameter, found, expected, why, a line each."""
+        """Return the table of all parameters: judgement, name, value found, value expected,
+        reason.
+        """
         rows = [("", "parameter", "found", "expected", "why")]
         wrong = self._wrong()
         for name, rule in self.rules.items():

@@ -1,4 +1,6 @@
-"""What the runner needs of a back-end, the one that sends nothing, and one whose commands wait."""
+"""The interface of the back-ends, the dry run that sends nothing, and a wrapper that delays
+commands.
+"""
 
 from collections import deque
 from dataclasses import dataclass
@@ -11,7 +13,7 @@ from hil.links.device import Port
 from hil.links.roster import Address, Announce, Roster, address_text
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 
-# how far a release has come
+# states of a release
 IDLE = "idle"
 PENDING = "pending"
 ACCEPTED = "accepted"
@@ -21,50 +23,51 @@ WAIT = "wait"
 FOLLOW = "follow"
 HOLD = "hold"
 LAND = "land"
-"""What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands
-by itself.
+"""Modes of the autopilot: under somebody else's control, following commands, holding its
+position by itself, landing by itself.
 """
 
 Command = tuple[float, ...]
 """Collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up."""
 
-ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is in time
+ROUNDING = 1e-6  # tolerance of times that are sums [s]
 
 
 @dataclass(frozen=True)
 class Status:
-    """A back-end's knowledge of its autopilot at a tick; recorded, so that a replay
-    decides alike.
+    """The state of the autopilot at a tick, as the back-end knows it. It is recorded, so that a
+    replay decides the same.
     """
 
-    # heard from lately, armed, audited, and in a mode that it was asked for or may be taken from
+    # it has answered lately, is armed and audited, and is in a mode that was requested or from
+    # which it may be taken
     connected: bool
-    note: str = ""  # why not, for people
+    note: str = ""  # why it is not connected, for the operator
     release: str = IDLE  # IDLE, PENDING, ACCEPTED or FAILED
     mode: str = FOLLOW  # WAIT, FOLLOW, HOLD or LAND
-    # what ends the run, whatever else is well: a parameter audit that failed
+    # a failed parameter audit, which ends the run in any case
     fault: str | None = None
-    # that it hovers with by itself, by its own report and the calibration [N]; None: not known
+    # thrust in its own hover, by its report and the calibration [N]; None: unknown
     thrust: float | None = None
-    # body rates that it last reported [rad/s], x forward, y left, z up; None: it reports none
+    # body rates that it last reported [rad/s], x forward, y left, z up; None: not reported
     rates: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
 class BackendParams(Bounded):
-    """Settings that every vehicle on the other side has."""
+    """Settings that all vehicles share."""
 
     thrust: HoverThrustParams
     mechanism_lag: NotNegative  # from the release command to separation [s]
-    release_timeout: Positive  # without a final answer the release has failed [s]
+    release_timeout: Positive  # time without a final answer after which the release has failed [s]
 
 
 @dataclass(frozen=True)
 class PortVehicleParams(BackendParams):
-    """A vehicle on a port of its own."""
+    """Settings of a vehicle on a separate port."""
 
     device: str  # see hil.links.device
-    remote: bool  # whether the device may leave this machine
+    remote: bool  # whether the device may be on another machine
     silence: Positive  # after which it counts as lost [s]
 
 
@@ -74,56 +77,58 @@ class Backend:
     Methods that a subclass does not define do nothing."""
 
     name = ""
-    holds = False  # whether the autopilot has modes of its own that hold a place and land
+    holds = False  # whether the autopilot has modes that hold the position and land
 
     def status(self, host_time: float) -> Status:
-        """Return what is known now."""
+        """Return the current status."""
         raise NotImplementedError
 
     def send(self, command: Command, host_time: float) -> bool:
-        """Send a command; whether it was taken."""
+        """Send a command; return whether the port accepted it."""
         raise NotImplementedError
 
     def ask(self, mode: str, host_time: float) -> None:
-        """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted."""
+        """Request FOLLOW, HOLD or LAND; called at every tick while the mode is wanted."""
 
     def release(self, when: float) -> None:
         """Open the mechanism at a time [s] on the runner's clock; called once a throw."""
 
     def stop_release(self) -> None:
-        """Send no (further) release of this throw; one that was sent may still be answered."""
+        """Send no further release of this throw; a release that was sent may still be answered."""
 
     def rearm(self) -> None:
-        """Forget the last throw's release: the operator has armed the next one."""
+        """Forget the last throw's release: the operator has armed the next throw."""
 
     def service(self, host_time: float) -> None:
-        """Do what is due: heartbeats, the release, its repetition."""
+        """Send what is due: heartbeats, the release, its repetition."""
 
     def due(self) -> float | None:
-        """Return when :meth:`service` is to be called at the latest [s]; None for the next tick."""
+        """Return the time at which :meth:`service` must be called at the latest [s]; None: at
+        the next tick.
+        """
         return None
 
     def abort(self, host_time: float) -> None:
         """Ask the autopilot to land; called at every tick of an aborted run.
 
-        A pilot who has taken over is left alone.
+        Nothing is asked of a vehicle that its pilot has taken over.
         """
 
     def surrender(self, host_time: float) -> None:
-        """Give the vehicle to its own hold, or to the pilot; called at every tick of a run that
-        ended so.
+        """Hand the vehicle back to its hold mode or to the pilot; called at every tick of a run
+        that ended by handing back.
         """
         self.ask(HOLD, host_time)
 
     def finish(self, host_time: float) -> None:
-        """Put the autopilot at rest, as far as that is ours: the run is over."""
+        """End the run on the autopilot: disarm it if the runner armed it."""
 
     def close(self) -> None:
-        """Give back ports of its own."""
+        """Close the back-end's own ports."""
 
 
 class DryRun(Backend):
-    """Sends nothing."""
+    """A back-end that sends nothing."""
 
     name = "dry-run"
     _release = IDLE
@@ -142,27 +147,27 @@ class DryRun(Backend):
 
 
 class Release:
-    """One release: sent at its time, repeated until it is answered, never again once it was
+    """One release: sent at its time, repeated until it is answered, and not sent again once it was
     answered or stopped.
 
     Attributes:
-        state: IDLE, PENDING, ACCEPTED or FAILED. sends: of this throw. note: how it ended. at: of
-            the next send [s].
-        answers: of all throws, from the first send to the first answer [s].
+        state: IDLE, PENDING, ACCEPTED or FAILED. sends: number in this throw. note: why it failed.
+            at: time of the next send [s].
+        answers: times from the first send to the first answer, of all throws [s].
     """
 
     REPEAT = 0.04  # between two sends that have no answer yet [s]; answers take 1 to 3 ms
 
     def __init__(self, timeout: float, read_back: bool = False):
-        """Start at rest.
+        """Start without a release.
 
-        Without a final answer within the time-out [s], and a movement where it is read back, it has
-        failed.
+        A release fails without a final answer within the time-out [s], and with ``read_back`` also
+        without a movement of the output.
         """
         self.timeout = timeout
         self.read_back = read_back
         self.answers: list[float] = []
-        self.open_at_rest = self._begun = False  # the output, before the first release
+        self.open_at_rest = self._begun = False  # of the output, before the first release
         self.reset()
 
     def reset(self) -> None:
@@ -176,7 +181,7 @@ class Release:
         self._answered = self._moved = self._closed = False
 
     def start(self, when: float) -> None:
-        """Open at a time [s]."""
+        """Schedule the release at a time [s]."""
         if self.state == IDLE:
             self.state = PENDING
             self.at = when
@@ -185,16 +190,16 @@ class Release:
             self.open_at_rest = False
 
     def stop(self) -> None:
-        """Send no more; what was never sent never happened."""
+        """Send no more; a release that was never sent is forgotten."""
         self.at = None
         if self.state == PENDING and not self.sends:
             self.state = IDLE
 
     def answer(self, accepted: bool | None, text: str = "") -> None:
-        """Take an answer: True accepted, False refused, None at work on it."""
+        """Process an answer: True accepted, False refused, None in progress."""
         if self.state != PENDING or not self.sends:
             return
-        self.at = None  # heard: not to be sent again
+        self.at = None  # answered: not to be sent again
         if self._sent is not None:
             self.answers.append(perf_counter() - self._sent)
             self._sent = None
@@ -205,8 +210,8 @@ class Release:
             self._judge()
 
     def output(self, is_open: bool) -> None:
-        """Note where the mechanism's output is; it has moved when it is open, and was seen closed
-        in this throw before.
+        """Process a read-back of the mechanism's output. It has moved if it is open now and was
+        closed before in this throw.
         """
         self._closed |= not is_open
         self.open_at_rest = is_open and not self._begun
@@ -215,7 +220,7 @@ class Release:
             self._judge()
 
     def due(self, host_time: float) -> bool:
-        """Return whether to send it now; the caller does."""
+        """Return whether the caller has to send the release now."""
         if self.state != PENDING:
             return False
         if host_time - self._first > self.timeout:
@@ -245,12 +250,13 @@ class Release:
 
 
 class Autopilot(Backend):
-    """An autopilot with a release that is answered and settings that are audited; the children
-    speak its protocol.
+    """An autopilot that answers the release and whose settings are audited; subclasses implement
+    its protocol.
 
     Attributes:
-        audit: of its settings. release_record: of this throw. texts: that it said, the newest last.
-        share: last share of thrust that it reported, 0 to 1. voltage: of its battery [V].
+        audit: of its settings. release_record: of this throw. texts: messages of the autopilot, the
+            newest last.
+        share: share of full thrust that it last reported, 0 to 1. voltage: of its battery [V].
         rates: body rates that it last reported [rad/s], x forward, y left, z up.
     """
 
@@ -265,15 +271,15 @@ class Autopilot(Backend):
         self.texts: list[str] = []
 
     def _note(self, host_time: float) -> tuple[str, str]:
-        """Return what is wrong, or nothing; and what the autopilot does."""
+        """Return the problem ("" if there is none) and the autopilot's mode."""
         raise NotImplementedError
 
     def _flies_itself(self) -> bool:
-        """Return whether it flies, and nothing of ours is followed."""
+        """Return whether it flies without following the runner."""
         return False
 
     def _hint(self) -> str:
-        """Return what it waits for, though nothing is wrong."""
+        """Return what it waits for while there is no problem."""
         return ""
 
     def status(self, host_time: float) -> Status:
@@ -302,24 +308,24 @@ class Autopilot(Backend):
 
 
 class OnPort(Autopilot):
-    """A flight controller on a port of its own that neither holds nor lands by itself: it is taken,
-    and given up by silence.
+    """A flight controller on a separate port that neither holds nor lands by itself.
 
-    Where the runner falls silent its own failsafe or watchdog acts; so an abort has nothing to ask
-    for. ``dropped`` counts packets that could not be sent, ``roster`` what came and was refused."""
+    The runner gives it up by sending nothing: then its failsafe or watchdog acts, so an abort
+    requests nothing. ``dropped`` counts packets that could not be sent, ``roster`` those that were
+    received and refused."""
 
     protocol = ""
     params: PortVehicleParams
 
     def __init__(self, port: Port, params: PortVehicleParams, tell: Announce = None):
-        """Take an open port; ``tell`` is handed who is refused."""
+        """Use an open port; ``tell``: called with each refused sender."""
         super().__init__()
         self.params = params
         self.roster = Roster(tell=tell)
         self._port = port
         self._heard = -1e9
         self.dropped = 0
-        self._taken = self._raised = self._over = False  # asked for; has followed; over
+        self._taken = self._raised = self._over = False  # requested; has followed; the run is over
 
     def _note(self, host_time: float) -> tuple[str, str]:
         silence = host_time - self._heard
@@ -332,7 +338,7 @@ class OnPort(Autopilot):
         )
 
     def _judge(self) -> tuple[str, str]:
-        """Return the same as `_note`, of one that is heard."""
+        """Return problem and mode as `_note`, for a flight controller that answers."""
         raise NotImplementedError
 
     def ask(self, mode: str, host_time: float) -> None:
@@ -342,7 +348,9 @@ class OnPort(Autopilot):
         self._port.close()
 
     def _refuses(self, sender: Address) -> bool:
-        """Return whether a datagram is of another sender than the device names, and count it."""
+        """Return whether a datagram is from another sender than the device names; count it if
+        so.
+        """
         stranger = self._port.peer not in (None, sender)
         if stranger:
             self.roster.drop(sender, "datagram", f"the device is {address_text(self._port.peer)}")
@@ -355,15 +363,15 @@ class OnPort(Autopilot):
 
 
 class Held:
-    """A back-end whose commands go out a fixed time later; everything else is its own, the release
-    with its own lag too.
+    """A wrapper that delays a back-end's commands by a fixed time; everything else, including the
+    release, goes to the back-end at once.
 
-    A policy has learnt what its commands do after the trained delay. Poses can be carried forward
-    to a slower vehicle's time; for one that acts sooner than the vehicle of the training each
-    command waits for the difference."""
+    A policy is trained with a certain delay of its commands. For a vehicle with a longer delay,
+    poses are predicted further ahead; for a vehicle with a shorter one, each command waits for the
+    difference."""
 
     def __init__(self, backend: Backend, hold: float):
-        """Hold the commands of a back-end back by a time [s]."""
+        """Delay the commands of a back-end by ``hold`` [s]."""
         self._backend = backend
         self._hold = hold
         self._taken = True
@@ -373,7 +381,7 @@ class Held:
         return getattr(self._backend, name)
 
     def send(self, command: Command, host_time: float) -> bool:
-        """Let a command wait; whether the last one that went out was taken."""
+        """Queue a command; return whether the port accepted the last one that was sent."""
         self._waiting.append((host_time + self._hold, command))
         return self._taken
 
@@ -391,6 +399,6 @@ class Held:
         return min(times, default=None)
 
     def finish(self, host_time: float) -> None:
-        """End; nothing goes out after it."""
+        """Discard the waiting commands and finish."""
         self._waiting.clear()
         self._backend.finish(host_time)

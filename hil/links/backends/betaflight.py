@@ -1,15 +1,17 @@
-"""Betaflight over MSP: rates and thrust as stick positions, release on an AUX channel.
+"""Back-end of Betaflight over MSP: rates and thrust as stick positions, the release on an AUX
+channel.
 
-The flight controller has no hold of its own and hears no poses; the runner's hover controller flies
-before and after the throw. Two ways to be heard: MSP OVERRIDE (``arm_channel = 0``): a real
-receiver supplies all channels, and while the pilot holds a switch the four sticks and the release
-channel are ours. When the runner dies there, the last sticks count for ever, until the pilot
-switches off; since 2026.6 the receiver's channels count again soon. And RX_MSP (``arm_channel`` an
-AUX): all channels are ours, for benches and software only; silence idles the motors, then disarms.
+The flight controller has no hold mode and uses no poses, so the runner's hover controller flies
+before and after the throw. It accepts the runner's channels in two ways. MSP OVERRIDE
+(``arm_channel = 0``): a receiver supplies all channels, and while the pilot holds a switch the
+runner supplies the four sticks and the release channel. If the runner dies, the last sticks stay in
+force until the pilot releases the switch; since 2026.6 the receiver's channels return soon by
+themselves. RX_MSP (``arm_channel`` an AUX): the runner supplies all channels, for benches and
+software only; without frames the motors idle, then the vehicle disarms.
 
-MSP_SERVO does not show what CHANNEL_FORWARDING puts out: then the release is read back from its
-channel alone. ARM that is raised while the receiver is in failsafe has to go low again before the
-firmware arms.
+MSP_SERVO does not show the outputs of CHANNEL_FORWARDING; with it, the release is read back from
+its channel only. If ARM is raised while the receiver is in failsafe, it has to go low again before
+the firmware arms.
 
 Source: `hil.links.facts`, betaflight; betaflight.com, Controlling Betaflight From a Companion
 Computer Over MSP."""
@@ -49,38 +51,39 @@ LOW = FACTS["low"]
 HIGH = FACTS["high"]
 FORWARDING = FACTS["forwarding"]  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
 BLOCKS = FACTS["blocks"]
-"""Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM
-switch itself, which is raised while another one is set.
+"""Texts of the arming-disabled flags of MSP_STATUS, by bit. The highest bit of a version is the
+ARM switch itself; it is set if the switch was raised while another flag was set.
 """
 
 EXPIRES = FACTS["calendar_base"] + FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
-"""First version, year and month, in which the sticks of MSP OVERRIDE expire."""
+"""First version (year and month) in which the sticks of MSP OVERRIDE expire."""
 
 FEWEST_AUX = 4  # channels of a frame beside the sticks
 IMU = struct.Struct(f"<{FACTS['imu_rates']}x3h")  # body rates of MSP_RAW_IMU
-ARRIVED = 50  # a channel or output this near to its target has arrived [us]
-# between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
+ARRIVED = 50  # tolerance within which a channel or output has reached its target [us]
+# between two frames while nothing is commanded yet: without frames it cannot be armed [s]
 KEEP_ALIVE = 0.02
-# after which the mechanism closes again, so that the next payload can be hung on [s]
+# after which the mechanism closes again, so that the next payload can be attached [s]
 OPEN_TIME = 2.0
-# for which nothing may speak against arming before ARM is raised, or raised again [s]
+# for which no arming-disabled flag may be set before ARM is raised (again) [s]
 ARM_LOW = 0.5
 
-# what is asked for all the time, and how often [s]
+# messages that are requested all the time, and their periods [s]
 POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.RAW_IMU: 0.1, msp.ANALOG: 1.0}
 
 READ_BACK = 0.04
-"""Between two questions for the release [s].
+"""Between two requests for the state of the release [s].
 
-The firmware takes one command in a turn of its serial ports, 100 turns a second by its default:
-with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just
-after a release.
+The firmware processes one command in each cycle of its serial task, 100 per second by default. With
+one or two requests beside every frame, the frames queued up and were 0.1 to 0.3 s late just after a
+release.
 """
 
 RATES_PERIOD = 0.02
 RATES_TIME = 0.2
-"""Between two questions for body rates [s], and how long they are asked for once it follows, in
-which the signs of its rates show [s]: for longer they would make frames queue up.
+"""Between two requests for body rates [s], and for how long they are requested after it begins
+to follow [s]. In this time the signs of its rates show; longer requests would make frames queue
+up.
 """
 
 AXES = ("roll", "pitch", "yaw")
@@ -88,16 +91,18 @@ AXES = ("roll", "pitch", "yaw")
 
 @dataclass(frozen=True)
 class BetaflightParams(PortVehicleParams):
-    """The vehicle on the other side of MSP."""
+    """Settings of a Betaflight vehicle."""
 
     rates: RatesParams
-    minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
-    # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    minimum_us: Annotated[
+        int, Bound(900, 1200)
+    ]  # min_check: largest throttle that counts as 0 [us]
+    # AUX channel that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
     arm_channel: Annotated[int, Bound(0, 12)]
-    release_channel: Annotated[int, Bound(1, 12)]  # AUX that opens the mechanism, from 1
-    servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
-    servo_open_us: int  # there, with the mechanism open [us]
-    audit: bool  # read settings at connect and refuse to fly on a mismatch
+    release_channel: Annotated[int, Bound(1, 12)]  # AUX channel of the mechanism, from 1
+    servo_output: int  # output of MSP_SERVO that drives the mechanism, from 1; 0: not read back
+    servo_open_us: int  # value of that output with the mechanism open [us]
+    audit: bool  # whether settings are read when it connects, and a mismatch prevents the flight
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,7 +113,7 @@ class BetaflightParams(PortVehicleParams):
 
 
 class Betaflight(OnPort):
-    """A Betaflight flight controller; ``refused`` counts commands that it did not know."""
+    """The back-end of a Betaflight flight controller; ``refused`` counts commands unknown to it."""
 
     name = "betaflight"
     protocol = "MSP"
@@ -121,8 +126,8 @@ class Betaflight(OnPort):
         write: bool = False,
         tell: Announce = None,
     ):
-        """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are
-        written or not.
+        """Use MSP on an open port; ``write``: whether to correct wrong rates; ``tell``: called
+        with the table of settings.
         """
         super().__init__(port, params)
         self.parser = msp.FrameParser()
@@ -134,18 +139,18 @@ class Betaflight(OnPort):
             self._write_setting if write else None,
             tell,
         )
-        # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not reported yet
+        # rcmap: positions of roll, pitch, yaw and throttle in a frame; empty: not reported yet
         self._order: list[int] = []
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
         self._framed = self._boxed = self._read_back = -1e9
-        self._followed_at: float | None = None  # since when it has followed [s]
+        self._followed_at: float | None = None  # when it began to follow [s]
         self._flags = self._blocks = 0
-        # since when nothing speaks against arming, with ARM low
+        # since when no arming-disabled flag is set, with ARM low
         self._free_since: float | None = None
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
-        self._pilots_us = LOW  # throttle that the pilot flew with
+        self._pilots_us = LOW  # the pilot's last throttle
         self._opened: float | None = None
         self.refused = 0
 
@@ -177,7 +182,7 @@ class Betaflight(OnPort):
     def _judge(self) -> tuple[str, str]:
         if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
-        has_all = self.params.arm_channel > 0  # all channels are ours
+        has_all = self.params.arm_channel > 0  # the runner supplies all channels
         armed = self._box(BOX_ARM)
         ours = has_all or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
@@ -200,7 +205,7 @@ class Betaflight(OnPort):
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us
-        # arming wants the throttle low
+        # arming requires low throttle
         waiting = self.params.arm_channel and not self._box(BOX_ARM)
         throttle = LOW if waiting else round(low + share * (HIGH - low))
         self._sticks_us = (*(self.sticks.position(i, r) for i, r in enumerate(rates)), throttle)
@@ -208,7 +213,7 @@ class Betaflight(OnPort):
 
     def _frame(self, host_time: float) -> bool:
         p = self.params
-        if not self._order:  # a stick in another's place is worse than none
+        if not self._order:  # no frame before the channel order is known
             return False
         channels = [LOW] * (STICKS + max(FEWEST_AUX, p.arm_channel, p.release_channel))
         for i, value in enumerate(self._sticks_us):
@@ -220,8 +225,8 @@ class Betaflight(OnPort):
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
     def _arms(self, host_time: float) -> bool:
-        """Return whether ARM is to be high: not before nothing has spoken against it for a while,
-        and low again where something does.
+        """Return whether ARM has to be high: once no arming-disabled flag has been set for a
+        while, and as long as none is set before it is armed.
         """
         if not self._taken or self._over:
             return False
@@ -230,8 +235,8 @@ class Betaflight(OnPort):
         )
 
     def stop_release(self) -> None:
-        """Send no release any more; a channel that was not read back goes back, so that nothing
-        opens later.
+        """Send no further release; if the release is not confirmed, set its channel low again,
+        so that the mechanism does not open later.
         """
         super().stop_release()
         if self.release_record.state != ACCEPTED:
@@ -251,7 +256,7 @@ class Betaflight(OnPort):
         if self._raised and self._followed_at is None:
             self._followed_at = host_time
         self._poll(host_time)
-        if self._boxes and self._heard > 0.0:  # while it is armed nothing may be written
+        if self._boxes and self._heard > 0.0:  # the audit may write settings
             self.audit.service(host_time)
         self._serve_release(host_time)
         ours = self.params.arm_channel and not self._taken and not self._over
@@ -259,7 +264,7 @@ class Betaflight(OnPort):
             self._frame(host_time)
 
     def _poll(self, host_time: float) -> None:
-        """Ask for what is due."""
+        """Send the requests that are due."""
         judged = self._followed_at is not None and host_time - self._followed_at <= RATES_TIME
         periods = POLLS | ({msp.RAW_IMU: RATES_PERIOD} if judged else {})
         if not self.release_record.read_back:
@@ -274,7 +279,7 @@ class Betaflight(OnPort):
             self._write(msp.RX_MAP)
 
     def _serve_release(self, host_time: float) -> None:
-        """Open the mechanism, ask whether it has opened, and close it after a while."""
+        """Open the mechanism, request its state, and close it after a while."""
         if self.release_record.due(host_time) and self._opened is None:
             self._opened = host_time
             self._frame(host_time)
@@ -291,14 +296,14 @@ class Betaflight(OnPort):
 
     @property
     def _expires(self) -> bool:
-        """Whether the last sticks cease to count when nothing follows."""
+        """Whether the last sticks expire without further frames."""
         return self.audit.found.get("fc_version", 0.0) >= EXPIRES - 1e-6
 
     def surrender(self, host_time: float) -> None:
-        """Give the vehicle to the pilot: fall silent where the receiver's channels then count
-        again; else hold level with the throttle that the pilot hovered with, until the switch.
+        """Hand the vehicle back to the pilot: send nothing if the sticks expire; else keep it level
+        with the pilot's last throttle, until the pilot releases the switch.
 
-        With all channels by MSP silence leads to the failsafe.
+        If the runner supplies all channels, sending nothing triggers the failsafe.
         """
         if self.params.arm_channel or self._expires:
             return
@@ -306,7 +311,7 @@ class Betaflight(OnPort):
         self._frame(host_time)
 
     def finish(self, host_time: float) -> None:
-        """Disarm where the arming channel is ours."""
+        """Disarm, if the runner supplies the arming channel."""
         self._over = True
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)
         if self.params.arm_channel:
@@ -371,7 +376,7 @@ class Betaflight(OnPort):
         self._blocks = frame.number("<I", end + 1) or 0
 
     def _hear_channels(self, frame: msp.Frame) -> None:
-        """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
+        """Process MSP_RC: roll, pitch, yaw, throttle, AUX 1 and so on, independent of rcmap."""
         p = self.params
         channels = frame.words()
         if len(channels) < STICKS:
@@ -384,7 +389,7 @@ class Betaflight(OnPort):
             self.release_record.answer(True)
 
     def _write_setting(self, name: str, value: float) -> None:
-        """Write a number of the rate profile, and keep it; never while armed."""
+        """Write a value of the rate profile and save it; never while armed."""
         setting = SETTINGS[name]
         if (
             setting.command != msp.RC_TUNING
@@ -408,12 +413,12 @@ _HANDLERS = {
     msp.RX_MAP: Betaflight._hear_order,
     msp.RC_TUNING: Betaflight._hear_tuning,
 }
-"""Answer -> the method that takes it; others tell settings alone."""
+"""Answer -> the method that processes it; other answers only hold settings."""
 
 
 @dataclass(frozen=True)
 class AnswerField:
-    """The place of a setting in an answer."""
+    """The position of a setting in an answer."""
 
     command: int
     offset: int  # in the payload
@@ -426,22 +431,22 @@ SETTINGS = {
     for name, row in FACTS.items()
     if name.startswith("tells_")
 }
-"""Which answer tells which setting. Some hold more than a number: see :func:`settings`."""
+"""Setting -> its field in an answer. Some settings are more than a number: see :func:`settings`."""
 
 
 def is_on(box: int, boxes: tuple[int, ...], flags: int) -> bool:
-    """Return whether a flight mode is on, by MSP_BOXIDS and the flags of MSP_STATUS."""
+    """Return whether a flight mode is on, from MSP_BOXIDS and the flags of MSP_STATUS."""
     return box in boxes and bool(flags >> boxes.index(box) & 1)
 
 
 def describe_blocks(flags: int) -> str:
-    """Return what speaks against arming, in words."""
+    """Return a text of the arming-disabled flags."""
     named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
     return f"{', '.join(named) or 'ARM switch'} (flags {flags:#x})"
 
 
 def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
-    """Return settings that an answer tells; what is cut short tells nothing."""
+    """Return the settings in an answer; truncated fields are left out."""
     mine = {name: setting for name, setting in SETTINGS.items() if setting.command == frame.command}
     values = {
         name: float(setting.scale * n)
@@ -464,8 +469,8 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
 
 
 def _aux(frame: msp.Frame, box: int, preferred: int) -> float:
-    """Return AUX, from 1, of a flight mode by MSP_MODE_RANGES: box, channel, first and last step of
-    25 us; 0: none.
+    """Return the AUX channel, from 1, of a flight mode by MSP_MODE_RANGES (box, channel, first
+    and last step of 25 us); 0: none.
     """
     size = FACTS["range_bytes"]
     starts = range(0, len(frame.payload) - size + 1, size)

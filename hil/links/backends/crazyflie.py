@@ -1,13 +1,13 @@
-"""Crazyflie over CRTP: body rates and thrust as manual set-points, the release as a parameter,
-poses to its estimator.
+"""Back-end of the Crazyflie over CRTP: body rates and thrust as manual set-points, the release as a
+parameter, poses for its estimator.
 
-The runner's hover controller flies before and after the throw. A manual set-point says itself that
-it holds rates, and its thrust is neither locked nor cut; it flies as soon as the vehicle is armed.
-Legacy set-points, which others may send, mean what the parameters of ``flightmode`` say. These,
-the controller and the motors' override are set, and answered, before anything is armed. Silence
-levels the vehicle, and stops its motors later (its supervisor). Its body rates come by logging. A
-vehicle that is handed back holds its place by its own position controller, as long as it hears
-set-points of a place.
+The runner's hover controller flies before and after the throw. A manual set-point states that it
+holds rates, and its thrust is neither locked nor cut; the vehicle follows it as soon as it is
+armed. The parameters of ``flightmode`` define the meaning of legacy set-points, which others may
+send. These parameters, the controller and the motors' override are set and acknowledged before the
+vehicle is armed. Without set-points its supervisor levels the vehicle, and later stops its motors.
+Body rates come from its logging. A vehicle that is handed back holds its position by its own
+controller, as long as it receives position set-points.
 
 Source: `hil.links.facts`, crazyflie."""
 
@@ -36,14 +36,14 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.rotations import tilt_and_heading
 
 FACTS = values("crazyflie")
-# parameters that are set before it is armed
+# parameters set before arming
 MODES = {name: fact for name, fact in facts("crazyflie").items() if "." in name}
 
-ASK = 0.1  # between two questions for its state [s]
+ASK = 0.1  # between two requests for its state [s]
 ARM_PERIOD = 0.2  # between two requests to arm [s]
-HOLDS = 2.0  # for which a vehicle that is handed back holds its place [s]
-DESCENT = 0.3  # at which it sinks then [m/s]
-SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
+HOLDS = 2.0  # for which a vehicle that is handed back holds its position [s]
+DESCENT = 0.3  # at which it descends then [m/s]
+SHORTEST = 0.02  # least duration over which a change of the yaw rate is spread: a period [s]
 
 BLOCKS = {
     FACTS["tumbled"]: "tumbled",
@@ -55,13 +55,13 @@ BLOCKS = {
 
 @dataclass(frozen=True)
 class CrazyflieParams(PortVehicleParams):
-    """The vehicle on the other side of CRTP; its device: radio://0/80/2M/E7E7E7E7E7, usb://0, or
-    udpout:127.0.0.1:19850 of its software in the loop.
+    """Settings of a Crazyflie. Its device is radio://0/80/2M/E7E7E7E7E7, usb://0, or
+    udpout:127.0.0.1:19850 for its software in the loop.
     """
 
-    # of eight bits that opens the mechanism at 1: group.name of an app or a deck
+    # eight-bit parameter that opens the mechanism when it is 1: group.name of an app or a deck
     release_parameter: str
-    external_pose: bool = True  # send the vehicle's poses to its estimator
+    external_pose: bool = True  # whether the vehicle's poses are sent to its estimator
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,14 +76,16 @@ class CrazyflieParams(PortVehicleParams):
 
 
 class Crazyflie(OnPort):
-    """A Crazyflie; ``poses`` counts those that went to its estimator."""
+    """The back-end of a Crazyflie; ``poses`` counts the poses sent to its estimator."""
 
     name = "crazyflie"
     protocol = "CRTP"
     params: CrazyflieParams
 
     def __init__(self, port: Port, params: CrazyflieParams, tell: Announce):
-        """Speak CRTP on an open port; ``tell`` is handed the settings and who is refused."""
+        """Use CRTP on an open port; ``tell``: called with the table of settings and with refused
+        senders.
+        """
         super().__init__(port, params, tell)
         self.release_record = Release(params.release_timeout)
         self.poses = 0
@@ -93,7 +95,7 @@ class Crazyflie(OnPort):
         self._speaks = False
         self._place: tuple[tuple[float, ...], float] | None = None  # position [m], heading [deg]
         self._returned: tuple[float, tuple[float, ...], float] | None = None  # when, and where
-        self._yaw = 0.0, -1e9  # rate of yaw that was wanted last [rad/s], when [s]
+        self._yaw = 0.0, -1e9  # last commanded yaw rate [rad/s], and when [s]
         self._asked = self._armed_at = -1e9
 
     def _rules(self) -> list[Rule]:
@@ -102,7 +104,7 @@ class Crazyflie(OnPort):
         return [protocol, *modes, release]
 
     def _ask(self, name: str) -> None:
-        """Ask for the version, or set a parameter: its answer says that it is so."""
+        """Request the protocol's version, or set a parameter; the answer confirms its value."""
         if name == "protocol":
             self._put(crtp.ask_protocol())
         else:
@@ -125,7 +127,9 @@ class Crazyflie(OnPort):
         return ("disarmed" if self._raised else ""), WAIT
 
     def place(self, body: str, track: Track) -> None:
-        """Hand a pose of the vehicle to its estimator, as it was taken; for `Runner.watcher`."""
+        """Send an accepted pose of the vehicle to its estimator; called as
+        `StateEstimator.watcher`.
+        """
         pose = track.sample()[0]
         if body == VEHICLE and self.params.external_pose and pose.quat is not None:
             self._place = pose.pos, math.degrees(tilt_and_heading(pose.quat)[1])
@@ -142,11 +146,11 @@ class Crazyflie(OnPort):
         return self._put(crtp.manual(round(FACTS["manual_thrust"] * share), (x, y, z)))
 
     def _update_yaw(self, rate: float, host_time: float) -> float:
-        """Return the yaw rate to send for one that is wanted [rad/s].
+        """Return the yaw rate to send for a commanded yaw rate [rad/s].
 
-        A yaw rate moves the yaw that is held, and the error of that makes the vehicle turn: in a
-        steady turn it is ``(1 + D) / P`` of the rate. A change of the wanted rate brings its part
-        of the error within one period.
+        The firmware integrates the yaw rate to a desired yaw, and the yaw error turns the vehicle.
+        In a steady turn the error is ``(1 + D) / P`` times the rate. After a change of the
+        commanded rate, the change of this error is added within one period.
         """
         last, when = self._yaw
         self._yaw = rate, host_time
@@ -154,8 +158,8 @@ class Crazyflie(OnPort):
         return rate + error / max(host_time - when, SHORTEST)
 
     def surrender(self, host_time: float) -> None:
-        """Let it hold the place of its last pose by its own controller, and sink to the ground from
-        there; without poses fall silent: its supervisor acts.
+        """Let it hold the position of its last pose by its own controller, then descend to the
+        ground; without poses send nothing, so that its supervisor acts.
         """
         if self._place is None:
             return
@@ -166,8 +170,8 @@ class Crazyflie(OnPort):
         self._put(crtp.position((x, y, max(z - lower, 0.0)), yaw))
 
     def rearm(self) -> None:
-        """Forget the last release; the mechanism closes, so that the next payload can
-        be hung on.
+        """Forget the last release and close the mechanism, so that the next payload can be
+        attached.
         """
         super().rearm()
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
@@ -184,7 +188,7 @@ class Crazyflie(OnPort):
             self._put(crtp.ask_state())
             if not self._speaks:
                 self._put(crtp.ask_protocol())
-        if self._speaks and not self._state & FACTS["flying"]:  # nothing is set in flight
+        if self._speaks and not self._state & FACTS["flying"]:  # no parameter is set in flight
             self.audit.service(host_time)
             if self.audit.done:
                 self.gyro.service(host_time)
@@ -197,7 +201,7 @@ class Crazyflie(OnPort):
             self._put(crtp.set_parameter(self.params.release_parameter, 1))
 
     def finish(self, host_time: float) -> None:
-        """Stop the motors."""
+        """Stop the motors and disarm."""
         self._over = True
         self._put(crtp.manual(0, (0.0, 0.0, 0.0)))
         self._put(crtp.arm(False))
@@ -223,7 +227,7 @@ class Crazyflie(OnPort):
             self._hear_set(data[1:-1], data[-1])
 
     def _hear_set(self, name: bytes, error: int) -> None:
-        """Take the answer to a parameter that was set."""
+        """Process the answer to a parameter that was set."""
         release = self.params.release_parameter
         for rule in self.audit.rules:
             if name == crtp.encode_name(rule):

@@ -1,7 +1,7 @@
-"""The stream of body rates that a Crazyflie's logging sends.
+"""The stream of body rates from a Crazyflie's logging.
 
-Its variables have numbers that differ from build to build: they are looked up by name in its table
-of contents, put into a block, and the block is started. All of it happens on the ground.
+The numbers of logging variables differ from build to build. So the variables are looked up by name
+in the table of contents and put into a block, which is then started, all on the ground.
 
 Source: `hil.links.facts`, crazyflie, Logging."""
 
@@ -14,36 +14,36 @@ from hil.links.facts import values
 
 FACTS = values("crazyflie")
 NAMES = [f"gyro\0{axis}\0".encode() for axis in FACTS["log_gyro"]]
-BLOCK = 239  # ours among the blocks of others
-PERIOD_MS = 20  # between two of our blocks [ms]
-AT_ONCE = 8  # questions for variables that are out at a time
-ASK_AGAIN = 0.1  # for an answer that did not come [s]
+BLOCK = 239  # number of the runner's block
+PERIOD_MS = 20  # between two messages of the block [ms]
+AT_ONCE = 8  # requests for variables that are sent at a time
+ASK_AGAIN = 0.1  # time after which a missing answer is requested again [s]
 RATES = struct.Struct("<3f")
 ITEM = struct.Struct("<BHB")
 STAMP = 4  # bytes of block and time before the values
 
 
 class GyroStream:
-    """Body rates that the vehicle reports.
+    """A reader of the body rates that the vehicle reports.
 
     Attributes:
-        rates: the newest [rad/s], x forward, y left, z up; None before any came, and where the
-            firmware has no such variables.
+        rates: newest [rad/s], x forward, y left, z up; None before the first, and for firmware
+            without these variables.
     """
 
     def __init__(self, put: Callable[[bytes], bool]):
-        """Ask by ``put``, which takes a packet's bytes."""
+        """Send requests by ``put``, which takes a packet's bytes."""
         self._put = put
         self.rates: tuple[float, ...] | None = None
         self._count: int | None = None  # of the vehicle's variables
-        self._next = 0  # the first variable whose name is not known
+        self._next = 0  # first variable whose name is unknown
         self._numbers: dict[bytes, int] = {}
         self._created = False
         self._asked = -math.inf
         self._asked_for = None
 
     def service(self, host_time: float) -> None:
-        """Ask for the next step, again where its answer did not come."""
+        """Request the next step, again if its answer is missing."""
         step = (self._count, self._next, self._created)
         waits = step == self._asked_for and host_time - self._asked < ASK_AGAIN
         if waits or self.rates is not None:
@@ -66,7 +66,7 @@ class GyroStream:
         self._put(message("port_log", channel, data))
 
     def hear(self, channel: int, data: bytes) -> None:
-        """Take a packet of the logging port."""
+        """Process a packet of the logging port."""
         if channel == FACTS["log_contents"]:
             self._hear_contents(data)
         elif channel == FACTS["log_control"] and data[:2] == bytes([FACTS["log_create"], BLOCK]):
@@ -80,6 +80,6 @@ class GyroStream:
             self._count = int.from_bytes(data[1:3], "little")
         elif data[0] == FACTS["log_item"] and len(data) > ITEM.size:
             _, number, _ = ITEM.unpack_from(data)
-            self._next += number == self._next  # those behind a lost answer are asked for again
+            self._next += number == self._next  # variables after a lost answer are requested again
             if data[ITEM.size :] in NAMES:
                 self._numbers[data[ITEM.size :]] = number

@@ -1,8 +1,8 @@
-"""What ArduPilot and PX4 share: heartbeat, modes, set-points, release, parameters, over one MAVLink
-link.
+"""The part of the back-ends that ArduPilot and PX4 share: heartbeat, modes, set-points, release and
+parameters over one MAVLink link.
 
-Who flies is decided by the pilot. A mode that the runner did not ask for counts as a pilot who has
-taken over: the runner stops commanding and asks for nothing any more, an abort included."""
+The pilot decides who flies. A mode that the runner did not request means that the pilot has taken
+over: the runner stops commanding and requests nothing any more, not even in an abort."""
 
 import math
 from abc import ABC, abstractmethod
@@ -26,10 +26,10 @@ from hil.links.roster import Announce, MavlinkId, Party
 from visthrow.config.bounds import Bound, Positive
 
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
-# for which a new heartbeat, which shows whether the pilot has taken over, is waited for before
-# another mode is requested [s]
+# longest wait, before another mode is requested, for a new heartbeat, which shows whether the pilot
+# has taken over [s]
 CONFIRMATION_TIME = 0.1
-MOST_TEXTS = 1000  # that are kept
+MOST_TEXTS = 1000  # texts kept
 
 STREAM = (
     (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000),
@@ -38,12 +38,12 @@ STREAM = (
     (mav.MAVLINK_MSG_ID_ATTITUDE, 20_000),
     (mav.MAVLINK_MSG_ID_SYS_STATUS, 500_000),
 )
-"""Messages asked for at connect and their periods [us]: read-back of the mechanism, share of thrust
-in hover, the mode, which a heartbeat of 1 Hz tells up to a second late, body rates, and whether it
-may be armed.
+"""Messages requested when the autopilot connects, and their periods [us]: read-back of the
+mechanism, thrust share in hover, the mode (a heartbeat at 1 Hz would show it up to a second
+late), body rates, and whether it may be armed.
 """
 
-SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
+SERVO_NEAR = 50  # tolerance within which an output counts as open [us]
 
 HEARTBEAT = mav.MAVLink_heartbeat_message(  # ours
     mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, mav.MAV_STATE_ACTIVE, 3
@@ -55,28 +55,28 @@ CUSTOM = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 @dataclass(frozen=True)
 class AutopilotParams(BackendParams):
-    """A vehicle that speaks MAVLink."""
+    """Settings of a vehicle with MAVLink."""
 
     system: MavlinkId  # MAVLink id of the vehicle
     component: MavlinkId  # of its autopilot
     heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]
-    # take the vehicle out of its holding mode when all is ready; else the pilot's switch hands it
-    # over
+    # whether the runner takes the vehicle out of its hold mode when all is ready; else the pilot
+    # hands it over by a switch
     take: bool
-    arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
-    audit: bool  # read parameters at connect and refuse to fly on a mismatch
-    # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    arm: bool  # whether the runner arms it at the take-over: bench and software only; else the pilot arms
+    audit: bool  # whether parameters are read when it connects, and a mismatch prevents the flight
+    # output of SERVO_OUTPUT_RAW that drives the mechanism, from 1; 0: not read back
     servo_output: Annotated[int, Bound(0, 16)]
-    servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
-    # whether the motion capture's poses are sent to it as well; else it knows its place by itself
+    servo_open_us: Annotated[
+        int, Bound(500, 2500)
+    ]  # value of that output with the mechanism open [us]
+    # whether the motion capture's poses are sent to it; else it estimates its position by itself
     poses: bool
-    parameters: dict[str, float]  # that it must have besides
+    parameters: dict[str, float]  # further required values
 
 
 class MavlinkAutopilot(Autopilot, ABC):
-    """An autopilot on a MAVLink link; the children say which modes there are and what the
-    parameters must be.
-    """
+    """An autopilot on a MAVLink link; subclasses define the modes and the required parameters."""
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     holds = True
@@ -89,8 +89,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         write: bool = False,
         tell: Announce = None,
     ):
-        """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table.
-        Wrong parameters are written or not.
+        """Listen on a link, which the pose source may share; ``write``: whether to correct wrong
+        parameters; ``tell``: called with the audit's table.
         """
         super().__init__()
         self.params = params
@@ -101,22 +101,22 @@ class MavlinkAutopilot(Autopilot, ABC):
         self._heartbeat: Any = None
         self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
-        self._next: str | None = None  # mode that waits for a heartbeat before it is requested
+        self._next: str | None = None  # mode whose request waits for a heartbeat
         self._wished_at = -1e9
-        self._may: set[str | None] = set()  # the last role that was ours, and those asked for since
+        self._may: set[str | None] = set()  # last confirmed role, and those requested since
         self._reached = False
         self._taken_over = False
         self._ours = False  # whether it has ever followed
         self._was_armed = False  # since the runner took the vehicle
         self._arm_refused = ""
-        self._may_arm = True  # by its own checks, where it tells them
+        self._may_arm = True  # by its own checks, if it reports them
         self._kinds: dict[str, int] = {}  # of parameters, as MAV_PARAM_TYPE
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
-        self._servo = (  # one string for good: Python's cache of attributes keeps each new one
+        self._servo = (  # built once: Python's attribute cache would keep each new string
             f"servo{params.servo_output}_raw"
         )
         self._begin_audit()
-        self._exact = False  # of the share
+        self._exact = False  # whether the share comes from ATTITUDE_TARGET
         link.listen(self._hear)
         link.roster.moved.append(self._came_back)
 
@@ -133,8 +133,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         )
 
     def _came_back(self, party: Party) -> None:
-        """Begin anew with what speaks from another address: it may be another vehicle of the same
-        ids.
+        """Start again with an autopilot at another address: it may be another vehicle with the
+        same ids.
         """
         if party.name == "autopilot":
             self._heartbeat = None
@@ -142,12 +142,14 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._begin_audit()
 
     def _rule_values(self) -> dict[str, Any]:
-        """Return what rows of ``rules.toml`` name beside facts and configuration."""
+        """Return further values that rows of ``rules.toml`` name, beside facts and
+        configuration.
+        """
         return {}
 
     @abstractmethod
     def _role(self, mode: int) -> str | None:
-        """Return FOLLOW, HOLD or LAND by a heartbeat's custom mode; None for another one."""
+        """Return FOLLOW, HOLD or LAND for a heartbeat's custom mode; None for other modes."""
 
     @abstractmethod
     def _mode_numbers(self, mode: str) -> tuple[float, float]:
@@ -158,11 +160,11 @@ class MavlinkAutopilot(Autopilot, ABC):
         """Return the command that opens the mechanism, and its parameters."""
 
     def _decode(self, value: float, kind: int) -> float:
-        """Return a parameter's value out of a PARAM_VALUE's field."""
+        """Return a parameter's value from the field of PARAM_VALUE."""
         return value
 
     def _field(self, value: float, kind: int) -> float:
-        """Return a PARAM_SET's field for a value; inverse of :meth:`_decode`."""
+        """Return the field of PARAM_SET for a value; the inverse of :meth:`_decode`."""
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
@@ -226,7 +228,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         self._may_arm = not failed & mav.MAV_SYS_STATUS_PREARM_CHECK
 
     def _judge_mode(self) -> None:
-        """Judge whether the mode is still one of ours."""
+        """Update from a heartbeat whether the mode is as requested, or somebody has taken over."""
         role = self._role(self._heartbeat.custom_mode)
         if self._wanted is None:
             return
@@ -275,7 +277,7 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _note_taken(self, role: str | None, armed: bool) -> tuple[str, str]:
         """Return the note of a vehicle that the runner has taken."""
         p = self.params
-        if not armed and self._wanted != LAND:  # on the ground it disarms itself
+        if not armed and self._wanted != LAND:  # after landing it disarms itself
             arms = p.arm and not self._was_armed and not self._arm_refused
             return "" if arms else self._arm_refused or "disarmed", WAIT
         spools_up = p.arm and self._exact and not self.share
@@ -292,7 +294,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     @abstractmethod
     def _list_modes(self) -> str:
-        """Return modes that a throw may begin in, in words."""
+        """Return a text of the modes in which the take-over may begin."""
 
     def send(self, command: Command, host_time: float) -> bool:
         thrust, x, y, z = command
@@ -300,12 +302,12 @@ class MavlinkAutopilot(Autopilot, ABC):
         return self._link.send(attitude_target(host_time, self._target, share, (x, -y, -z)))
 
     def ask(self, mode: str, host_time: float) -> None:
-        """Ask until the heartbeat shows the mode."""
+        """Request a mode, until a heartbeat confirms it."""
         if mode != self._wanted:
             if not self._confirms(mode, host_time):
                 return
             first = self._wanted is None and self._heartbeat is not None
-            if first:  # the mode before it was the pilot's
+            if first:  # the present mode is the pilot's choice
                 self._may.add(self._role(self._heartbeat.custom_mode))
             self._may.add(mode)
             self._wanted = mode
@@ -325,10 +327,10 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
 
     def _confirms(self, mode: str, host_time: float) -> bool:
-        """Return whether another mode may be requested: once a heartbeat has come since the first
-        call for it, which shows a pilot who took over, or was waited for in vain.
+        """Return whether another mode may be requested: once a heartbeat has arrived since the
+        first call, which would show a take-over by the pilot, or the wait for it has timed out.
         """
-        if self._wanted is None:  # the mode is the pilot's
+        if self._wanted is None:  # no mode was requested before
             return True
         if mode != self._next:
             self._next = mode
@@ -381,4 +383,4 @@ _HANDLERS = {
     "VFR_HUD": MavlinkAutopilot._hear_hud,
     "SYS_STATUS": MavlinkAutopilot._hear_system,
 }
-"""Message -> the method that takes it; others are passed over."""
+"""Message -> the method that processes it; other messages are ignored."""

@@ -3,11 +3,11 @@
 SET_ATTITUDE_TARGET in OFFBOARD, DO_GRIPPER or DO_SET_ACTUATOR, Hold (AUTO.LOITER), Land
 (AUTO.LAND).
 
-OFFBOARD is left when set-points cease for COM_OF_LOSS_T, and up to 1.17 refused until they have
-come for a second; so the runner streams first and asks then. DO_GRIPPER is answered IN_PROGRESS
-first, and ACCEPTED after PD_GRIPPER_TO whatever moves: the read-back of the output is what says
-that it did. A gripper opens at the minimum of its output. Integer parameters travel as bytes in a
-float field.
+PX4 leaves OFFBOARD when set-points stop for COM_OF_LOSS_T. Up to version 1.17 it refuses OFFBOARD
+until they have arrived for a second, so the runner streams them before it requests the mode.
+DO_GRIPPER is answered IN_PROGRESS first, and ACCEPTED after PD_GRIPPER_TO even if nothing moves:
+only the read-back of the output shows a movement. A gripper opens at the minimum of its output.
+Integer parameters are sent as bytes in a float field.
 
 Source: `hil.links.facts`, px4.toml."""
 
@@ -28,29 +28,30 @@ MAIN_AUTO = FACTS["auto"]
 MAIN_OFFBOARD = FACTS["offboard"]
 AUTO_LOITER = FACTS["auto_loiter"]
 AUTO_LAND = FACTS["auto_land"]
-# set-points are streamed for this long before OFFBOARD is asked for; a longer pause begins anew [s]
-MARGIN = 0.2  # more than PX4 asks for [s]
-GAP = 0.6  # share of its longest pause
+# set-points are streamed for STREAM_FIRST before OFFBOARD is requested; a pause above STREAM_GAP
+# restarts that [s]
+MARGIN = 0.2  # beyond what PX4 requires [s]
+GAP = 0.6  # share of the longest pause that PX4 accepts
 STREAM_FIRST = FACTS["stream_first"] + MARGIN
 STREAM_GAP = GAP / FACTS["stream_hz"]
 
 
 @dataclass(frozen=True)
 class Px4Params(AutopilotParams):
-    """The vehicle on the other side."""
+    """Settings of a PX4 vehicle."""
 
-    # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
+    # mode after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
     hold: Literal["hold", "position"]
     release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
     # number of the gripper, or of the actuator set from 1 to 6
     gripper: Annotated[int, Bound(1, 6)]
     actuator_open: Annotated[float, Bound(-1.0, 1.0)]  # value of DO_SET_ACTUATOR that opens
-    # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
+    # parameter with the function of the mechanism's output, such as PWM_AUX_FUNC1; "": not read
     output_parameter: str
 
 
 class Px4(MavlinkAutopilot):
-    """A PX4 multicopter."""
+    """The back-end of a PX4 multicopter."""
 
     name = "px4"
     autopilot = mav.MAV_AUTOPILOT_PX4
@@ -62,7 +63,7 @@ class Px4(MavlinkAutopilot):
         if main == MAIN_OFFBOARD:
             return FOLLOW
         if main == MAIN_POSCTL and (self.params.hold == "position" or not self._ours):
-            return HOLD  # the pilot holds it by hand: until it is taken, or when it is given back
+            return HOLD  # by the pilot: before the take-over, or after handing back
         return {AUTO_LOITER: HOLD, AUTO_LAND: LAND}.get(sub) if main == MAIN_AUTO else None
 
     def _mode_text(self, mode: int) -> str:
@@ -84,7 +85,7 @@ class Px4(MavlinkAutopilot):
         return super().send(command, host_time)
 
     def ask(self, mode: str, host_time: float) -> None:
-        """Ask for a mode; for OFFBOARD set-points are streamed first."""
+        """Request a mode; OFFBOARD only after set-points were streamed."""
         streamed = (
             host_time - self._stream_since >= STREAM_FIRST
             and host_time - self._sent_at <= STREAM_GAP
@@ -128,12 +129,12 @@ def modes_of(custom: int) -> tuple[int, int]:
 
 
 def parameter_value(field: float, kind: int) -> float:
-    """Return a parameter's value out of a PARAM_VALUE's field, by its MAV_PARAM_TYPE."""
+    """Return a parameter's value from the field of PARAM_VALUE and its MAV_PARAM_TYPE."""
     return bytes_to_integer(field) if kind == mav.MAV_PARAM_TYPE_INT32 else field
 
 
 def bytes_to_integer(value: float) -> float:
-    """Return the integer whose bytes stand in a float field, as PX4 writes them."""
+    """Return the integer whose bytes PX4 wrote into a float field."""
     return float(struct.unpack("<i", struct.pack("<f", value))[0])
 
 

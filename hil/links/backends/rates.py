@@ -1,4 +1,4 @@
-"""Betaflight's rate curves and their inverse: which stick gives a body rate.
+"""Betaflight's rate curves and their inverse, from body rates to stick positions.
 
 Source: betaflight, src/main/fc/rc.c, applyBetaflightRates and applyActualRates; `hil.links.facts`.
 """
@@ -12,7 +12,7 @@ from hil.links.facts import values
 from visthrow.config.bounds import Bound, Bounded
 
 FACTS = values("betaflight")
-# numbers of rates_type; Raceflight, KISS and Quick are not spoken here
+# numbers of rates_type; Raceflight, KISS and Quick are not supported
 RATES_TYPES = {"betaflight": FACTS["rates_betaflight"], "actual": FACTS["rates_actual"]}
 RATE_LIMIT = FACTS["rate_limit"]  # largest rate of any set-point [deg/s]
 TRAVEL = FACTS["travel"]  # from the middle of a stick to its end [us]
@@ -26,7 +26,7 @@ Percent = Annotated[int, Bound(0, 100)]
 
 @dataclass(frozen=True)
 class RatesParams(Bounded):
-    """A rate profile, in the numbers that the flight controller stores; roll, pitch, yaw."""
+    """A rate profile in the flight controller's units; roll, pitch, yaw."""
 
     type: Literal["betaflight", "actual"]
     # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s. At 0 the curve
@@ -61,7 +61,7 @@ class RatesParams(Bounded):
 
 
 class Sticks:
-    """Body rates to stick positions, by the curve at every microsecond.
+    """A converter of body rates to stick positions, by tables of the curves at every microsecond.
 
     Convention: ours are x forward, y left, z up; a stick to the right rolls right (+x), one pushed
     forward pitches the nose down (+y), one to the right yaws right (-z). So pitch keeps its sign,
@@ -80,8 +80,8 @@ class Sticks:
         return tuple(table[-1] for table in self._tables)
 
     def position(self, axis: int, rate: float) -> int:
-        """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole
-        microseconds allow.
+        """Return the stick position [us], rounded to whole microseconds, for a body rate [rad/s]
+        about an axis of our body frame.
         """
         table = self._tables[axis]
         size = abs(rate)
