@@ -63,7 +63,7 @@ class AutopilotParams(BackendParams):
     # whether the runner takes the vehicle out of its hold mode when all is ready; else the pilot
     # hands it over by a switch
     take: bool
-    arm: bool  # whether the runner arms it at the take-over: bench and software only; else the pilot arms
+    arm: bool  # by the runner at the take-over: bench and software only; else the pilot arms
     audit: bool  # whether parameters are read when it connects, and a mismatch prevents the flight
     # output of SERVO_OUTPUT_RAW that drives the mechanism, from 1; 0: not read back
     servo_output: Annotated[int, Bound(0, 16)]
