@@ -43,7 +43,7 @@ those of a core that is busy.
 """
 
 FEWEST = 32
-"""Smallest number of environments in a piece: their step takes 0.5 ms, its launch 0.05 ms."""
+"""Smallest number of environments in a piece: a step takes 0.5 ms, its launch at most 0.1 ms."""
 LOOK = 0.01
 """Work of a kernel that only reads each state once, relative to a step."""
 

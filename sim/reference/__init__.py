@@ -1,3 +1,3 @@
-"""Independent float64 plant on MuJoCo C: oracle of the physics tests and stand-in for the real
+"""Independent float64 plant on MuJoCo C: reference of the physics tests and substitute for the real
 vehicle.
 """

@@ -1,4 +1,4 @@
-"""Batches of MuJoCo's C library."""
+"""Import of MuJoCo's batches, with a clear error for a mixed installation."""
 
 try:
     from mujoco.batch import Batch as Batch

@@ -1,20 +1,20 @@
 """MuJoCo models of quadrotor, rope and payload, built with ``MjSpec``.
 
-Body frames: a rod's body frame has its origin at the rod's upper end and its z axis against the
-rod's direction, so that a level quadrotor with a hanging rope has every relative rotation at
+Body frames: a rod's frame has its origin at the rod's upper end. Its z axis is opposite to the
+rod's direction, so that all relative rotations of a level quadrotor with a hanging rope are the
 identity.
 
 Joints:
 
-- ``universal``: two perpendicular hinges a segment, first about the frame's y axis, then about its
-  x axis. The first turns without limit, so a rope may fold back on itself in the pitch plane, where
-  throws happen; the pair is singular only where the second stands at +-90 deg, that is where a
+- ``universal``: two perpendicular hinges for each segment, first about the frame's y axis, then
+  about its x axis. The first has no limit, so that a rope may fold back on itself in the pitch
+  plane, the plane of throws. The pair is singular only if the second is at +-90 deg, that is if a
   segment points along +-y of its parent.
-- ``ball``: a ball joint a segment; no singularity. Axial spin is then a coordinate of its own that
-  no force drives.
+- ``ball``: a ball joint for each segment, without singularity. Axial spin is an additional
+  coordinate that no force drives.
 
-Joint damping acts on the relative rate of a universal joint, which lies in the plane of its two
-axes. Ball joints get none here: ``sim.reference.plant`` applies it as a couple."""
+The damping of a universal joint acts on its relative rate, which is in the plane of its two axes.
+Ball joints have no damping here: ``sim.reference.rope`` applies it as a couple."""
 
 from typing import Literal
 
@@ -22,8 +22,7 @@ import mujoco
 
 from sim.params import GRAVITY, BodyParams, RopeParams
 
-# inertia of a rod about its axis with universal joints [kg m^2]: they pass twist on, so that it
-# must not matter
+# inertia of a rod about its axis [kg m^2]: negligible, because universal joints transmit twist
 AXIAL_INERTIA = 1e-12
 
 
@@ -38,7 +37,7 @@ def set_inertial(
 
 
 def add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float) -> None:
-    """Hang a body on the one above by the joints of rod ``index``."""
+    """Connect a body to the body above by the joints of rod ``index``."""
     if joints == "ball":
         body.add_joint(name=f"ball{index}", type=mujoco.mjtJoint.mjJNT_BALL)
         return
@@ -63,14 +62,14 @@ def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
     vehicle.add_freejoint(name="root")
     set_inertial(vehicle, body.mass, 0.0, body.inertia)
     vehicle.add_site(name="centre")
-    # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every
-    # stage of RK4, an applied world force it would hold for the whole step.
+    # Actuators on a site rotate with the body in every stage of RK4; an applied force would be
+    # constant in the world frame over the step.
     add_pushes(spec, "centre", ("fx", "fy", "fz", "tx", "ty", "tz"))
     return vehicle
 
 
 def add_pushes(spec: "mujoco.MjSpec", site: str, names: tuple[str, ...]) -> None:
-    """Add actuators for force, then torque, in a site's frame."""
+    """Add actuators for force components, then torque components, in a site's frame."""
     for i, name in enumerate(names):
         gear = [0.0] * 6
         gear[i] = 1.0
@@ -89,11 +88,12 @@ def build_attached(
         body: mass and inertia of the quadrotor.
         rope: masses and lengths.
         joints: kind of the rope's joints.
-        stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment
-            and payload.
+        stretch: stiffness [N/m] and damping [N s/m] of a slide joint along the rope between last
+            segment and payload.
 
     Returns:
-        Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
+        Compiled model with the bodies ``vehicle``, ``rod0``, ... and, with ``stretch``,
+        ``payload``.
     """
     spec = new_spec()
     add_chain(rope, add_vehicle(spec, body), joints, stretch)
@@ -101,7 +101,7 @@ def build_attached(
 
 
 def build_free(rope: RopeParams, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
-    """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
+    """Build rope and payload without a vehicle: the first rod on a free joint, then ball joints."""
     spec = new_spec()
     add_chain(rope, spec.worldbody, "ball", stretch=stretch, free_root=True)
     return spec.compile()
@@ -115,8 +115,8 @@ def add_chain(
     free_root: bool = False,
     load: bool = True,
 ) -> "mujoco.MjsBody":
-    """Rods from the mount on a body, or with ``free_root`` from the world's origin, the last with
-    the payload (``load``) or without; returns the last body.
+    """Add rods at the mount of a body, or with ``free_root`` at the world's origin; the last one
+    includes the payload if ``load`` is true. Returns the last body.
 
     See :func:`build_attached`.
     """
@@ -124,8 +124,8 @@ def add_chain(
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
         mass, centre, transverse = rope.rod(i == rope.segments - 1 and load and stretch is None)
-        # Without twist in ball joints the axial inertia enters nothing; theirs keeps the mass
-        # matrix well scaled.
+        # Ball joints without twist do not depend on the axial inertia; this value keeps the mass
+        # matrix well conditioned.
         axial = transverse if joints == "ball" else AXIAL_INERTIA
         set_inertial(rod, mass, -centre, (transverse, transverse, axial))
         if i == 0 and free_root:

@@ -1,9 +1,9 @@
-"""The whole plant in float64: vehicle, rope and payload, release and flight, with the extras of the
-real world.
+"""Complete reference plant in float64: vehicle, rope, payload, release and free flight, with
+optional effects of real vehicles.
 
-Integration: classical RK4 over bodies, rope and block states together; MuJoCo gives the
-accelerations of each stage. Command switches, the separation and the instants of motion-capture
-samples fall on step edges exactly."""
+Classical RK4 integrates bodies, rope and blocks together; MuJoCo computes the accelerations of each
+stage. Steps end exactly at changes of the command, at the separation and at the times of
+motion-capture samples."""
 
 from dataclasses import MISSING, fields, replace
 
@@ -34,10 +34,9 @@ from sim.reference.snapshot import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
 BLOCK_STATES = slice(BODY, BODY + BLOCKS)  # columns of the blocks
-FREE = slice(BODY + BLOCKS, BODY + BLOCKS + 6)  # and of a loose rope's upper end
+FREE = slice(BODY + BLOCKS, BODY + BLOCKS + 6)  # columns of a loose rope's upper end
 LARGEST_DECAY = 2.2
-"""Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis.
-"""
+"""Largest product of decay rate and step [-]; RK4 is stable up to 2.78 on the real axis."""
 
 
 KNOWN_EXTENSIONS = {
@@ -54,11 +53,11 @@ KNOWN_EXTENSIONS = {
     "release.kick_w",
     "release.kick_along",
 }
-"""Parameters with a default that the plant has; the payload's drag stands among its extras."""
+"""Optional parameters that the plant supports. The payload's drag is also one of its extras."""
 
 
 def _refuse_unknown(params: PlantParams) -> None:
-    """Raise ValueError where the plant would fly something else than what the parameters say."""
+    """Raise ValueError if the plant does not support all parameters."""
     vehicle = params.vehicle
     parts = {
         "body": vehicle.body,
@@ -83,15 +82,15 @@ def _refuse_unknown(params: PlantParams) -> None:
 
 
 class ReferencePlant:
-    """Vehicles with ropes.
+    """A batch of vehicles with ropes.
 
-    Raises ValueError: a step that is not positive, or a parameter that this plant does not know.
+    Raises ValueError: a step that is not positive, or a parameter that is not supported.
 
     Args:
         params: vehicle, rope, release; of ``params.sim`` only the control period is used.
         extras: effects that the training simulator lacks.
-        seed: of every random draw.
-        count: E.
+        seed: of all random draws.
+        count: number of environments E.
         step: largest integration step [s].
     """
 
@@ -125,8 +124,8 @@ class ReferencePlant:
         cable_dir_w: ndarray | None = None,
         cable_vel_w: ndarray | None = None,
     ) -> None:
-        """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in
-        hover.
+        """Draw new vehicles and ropes and set their state, with rotors, battery and command queue
+        at hover.
 
         Raises ValueError: an array of another shape.
 
@@ -170,7 +169,9 @@ class ReferencePlant:
         self._begin(weight)
 
     def _begin(self, weight: ndarray) -> None:
-        """Set clock and queue to hover at this weight [N], shape (E,); nothing is released."""
+        """Reset the clock, the release and the queue, which is filled with hover at ``weight`` [N],
+        shape (E,).
+        """
         count = self.count
         hover = np.zeros((count, 4))
         hover[:, 0] = weight
@@ -203,16 +204,16 @@ class ReferencePlant:
         self._rope_mass = self._payload_mass + rope.rope_mass
         self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * normal((count, 3))
         self._next_wind = self._wind
-        # Compiling a model takes milliseconds; without these draws the ropes of the last episode
-        # serve on.
+        # Compiling a model takes milliseconds. Without these draws the last episode's ropes are
+        # reused.
         if self._ropes is None or (
             extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
         ):
             self._build_ropes(length, com)
 
     def _build_ropes(self, length: ndarray, com: ndarray) -> None:
-        """Build ropes of these lengths [m], shape (E,), on vehicles with these centres of mass [m],
-        shape (E, 3), and choose a step that bears them.
+        """Build ropes of the given lengths [m], shape (E,), on vehicles with the given centres of
+        mass [m], shape (E, 3), and choose a stable step.
         """
         extras = self.extras
         rope = self.params.rope
@@ -234,8 +235,8 @@ class ReferencePlant:
         else:
             stretch = None
         self._ropes = RopeDynamics(vehicle.body, ropes, stretch, rope.mount_damping)
-        # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d /
-        # (m l^2).
+        # The bending modes of light segments decay at rates up to 48 d / (m l^2), for which RK4 may
+        # be unstable.
         shortest = float(np.min(length) / rope.segments)
         inertia = rope.segment_mass * shortest**2
         fastest = 48.0 * (damping + rope.mount_damping) / inertia
@@ -248,7 +249,7 @@ class ReferencePlant:
         return np.array(self.params.air.wind_w) + np.array(self.extras.wind_mean_w)
 
     def _rope_of(self, state: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """Directions, their derivatives, elongation and its rate."""
+        """Return directions, their derivatives, elongation and its rate."""
         n, n_dot = (state[:, columns].reshape(len(state), -1, 3) for columns in self._rope_columns)
         return n, n_dot, state[:, -2], state[:, -1]
 
@@ -260,8 +261,8 @@ class ReferencePlant:
     def _upper_end(
         self, state: ndarray, rotation: ndarray | None = None
     ) -> tuple[ndarray, ndarray]:
-        """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of
-        the vehicles, where it is known.
+        """Return position and velocity of the rope's upper end, which is the mount while attached;
+        ``rotation``: of the vehicles, if already computed.
         """
         rotation = rotation_from_quat(state[:, QUAT]) if rotation is None else rotation
         arm = rotate(rotation, self._ropes.mount)
@@ -272,12 +273,12 @@ class ReferencePlant:
         return pos, np.where(on, state[:, VEL] + arm_dot, free[:, 3:])
 
     def _points(self, state: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        """Joints of the ropes, position and velocity of the payloads."""
+        """Return the joints of the ropes, and position and velocity of the payloads."""
         return self._ropes.points(*self._upper_end(state), self._rope_of(state))
 
     def _rates(self, state: ndarray, command: ndarray, wind_w: ndarray, moving: ndarray) -> ndarray:
-        """Time derivative of the whole state; ropes that have landed and environments not
-        ``moving`` stand still.
+        """Return the time derivative of the whole state. Ropes of landed payloads are at rest.
+        Where ``moving`` is false, ropes are not accelerated and do not act on vehicles.
         """
         vehicle = self.params.vehicle
         rates = np.zeros_like(state)
@@ -334,8 +335,8 @@ class ReferencePlant:
         drag_w: ndarray,
         moving: ndarray,
     ) -> tuple[ndarray, ndarray]:
-        """Write the rates of bodies that ropes pull or that fall with one into ``rates``; return
-        the second derivatives of the ropes' directions and of their stretch.
+        """Write the accelerations of vehicles with ropes and of loose ropes into ``rates``; return
+        the second derivatives of the ropes' directions and elongations.
         """
         second = np.zeros_like(rope[0])
         stretch_dot = np.zeros(self.count)
@@ -358,8 +359,8 @@ class ReferencePlant:
         return second, stretch_dot
 
     def _pull(self) -> ndarray:
-        """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
-        acceleration.
+        """Return the rope's force on the mount along its first segment [N], shape (E,), computed
+        from the vehicles' accelerations with and without the rope.
         """
         times = np.array(self._queue_times)
         commands = np.array(self._queue_commands)
@@ -372,12 +373,12 @@ class ReferencePlant:
         return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
 
     def step(self, command: ndarray, release: ndarray | bool = False) -> None:
-        """Give a command now and advance one control period.
+        """Queue a command and advance by one control period.
 
         Args:
             command: collective thrust [N] and body rates [rad/s], shape (E, 4); acts after the
                 delay of the queue.
-            release: latch the release now, shape (E,), bool; a latch does not untrip.
+            release: trip the latch now, shape (E,), bool; a latch stays tripped.
         """
         count = self.count
         params = self.params
@@ -409,7 +410,7 @@ class ReferencePlant:
         self._prune(end)
 
     def _advance(self, end: float) -> None:
-        """Integrate one period; keep the state of which the motion capture tells at its end."""
+        """Integrate one period, and store the state that motion capture measures at its end."""
         sample = end - self.extras.mocap_latency % (end - self.time)
         self._integrate(self.time, sample, end)
         self._samples.append((sample, replace(self.state, time=sample)))
@@ -417,7 +418,7 @@ class ReferencePlant:
         self._separate(np.full(self.count, end))
 
     def _integrate(self, start: float, stop: float, end: float) -> None:
-        """Integrate a part of the period up to ``end``, from event to event in each
+        """Integrate a part of the period that lasts until ``end``, from event to event in each
         environment.
         """
         times = np.array(self._queue_times)
@@ -446,8 +447,8 @@ class ReferencePlant:
             clock = clock + column
 
     def _separate(self, clock: ndarray) -> None:
-        """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's
-        velocity.
+        """Detach the ropes whose separation is due; their upper ends keep the mount's velocity plus
+        the release's kick.
         """
         due = self._attached & (self._separation <= clock + vehicle_blocks.TIME_TOLERANCE)
         if np.any(due):
@@ -464,7 +465,7 @@ class ReferencePlant:
         n_dot -= np.sum(n * n_dot, -1, keepdims=True) * n
 
     def _land(self, before: ndarray, clock: ndarray, step: ndarray) -> None:
-        """Record payloads that pass the landing height within this step."""
+        """Record the payloads that reach the landing height in this step."""
         flying = ~self._attached & ~self._landed & (step > 0.0)
         if not np.any(flying):
             return
@@ -486,7 +487,7 @@ class ReferencePlant:
 
     @property
     def state(self) -> Snapshot:
-        """The true state now."""
+        """Current true state."""
         state = self._state
         rotation = rotation_from_quat(state[:, QUAT])
         blocks = state[:, BLOCK_STATES]
@@ -510,7 +511,7 @@ class ReferencePlant:
 
     @property
     def landing(self) -> PayloadLandings:
-        """Landing places and times of the payloads."""
+        """Landing points and times of the payloads."""
         separated = np.where(self._attached, np.nan, self._separation)
         return PayloadLandings(
             self._landed.copy(), self._landing_point.copy(), self._landing_time.copy(), separated
@@ -518,15 +519,15 @@ class ReferencePlant:
 
     @property
     def exposed(self) -> Snapshot:
-        """The truth of which :meth:`measure` tells."""
+        """True state at the time that :meth:`measure` refers to."""
         return self._samples[0][1]
 
     def measure(self) -> Snapshot:
-        """Return the state as motion capture and gyro give it: late by the latency, with noise
-        drawn anew at each call.
+        """Return the state as measured by motion capture and gyro: delayed by the latency, with new
+        noise in each call.
 
-        ``time`` is when the sample was taken. ``cable_points_w`` and the flags are not measured:
-        points come without noise for drawing, the flags as the vehicle knows them now."""
+        ``time`` is the time of the sample. ``cable_points_w`` and the flags are not measured: the
+        points are exact, for drawing, and the flags are the vehicle's current ones."""
         extras = self.extras
         rng = self._rng
         time, sample = self._samples[0]

@@ -1,5 +1,5 @@
-"""The vehicle of ``sim.reference.plant``: the seven blocks on a rigid body, whose place MuJoCo
-takes while the rope is on.
+"""Vehicle of ``sim.reference.plant``: the seven blocks and the rigid body. While the rope is
+attached, MuJoCo computes the body's accelerations.
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,14 @@ BODY = 13
 
 @dataclass(frozen=True)
 class VehicleErrors:
-    """Errors of E built vehicles against their parameters."""
+    """Errors of E vehicles relative to their parameters."""
 
-    thrust_gain: ndarray  # of each motor, 1 for none, shape (E, 4)
+    thrust_gain: ndarray  # factor on each motor's thrust, shape (E, 4)
     com_offset: ndarray  # centre of mass from the frame's origin, body frame [m], shape (E, 3)
 
 
 def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> ndarray:
-    """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""
+    """Return the rotor hubs relative to the centre of mass [m], shape (E, 4, 3)."""
     rotors = vehicle.rotors
     hubs = np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T
     return hubs - errors.com_offset[:, None, :]
@@ -40,13 +40,13 @@ def initial_blocks(
 ) -> ndarray:
     """Return block states in steady hover, shape (E, 15).
 
-    Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that
-    carries ``weight``, terminal voltage settled under that load.
+    The filters of set-point and gyro have settled at ``rate_b``, the integral is 0, the rotors'
+    thrust equals ``weight``, and the terminal voltage has settled under this load.
 
     Args:
         vehicle: parameters.
         rate_b: [rad/s], shape (E, 3).
-        weight: to be carried [N], shape (E,).
+        weight: [N], shape (E,).
         used: fraction of the battery used, shape (E,).
     """
     count = len(weight)
@@ -82,7 +82,7 @@ def vehicle_rates(
     rate_b: ndarray,
     near_ground: ndarray | float,
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Run the seven blocks.
+    """Evaluate the seven blocks.
 
     Args:
         vehicle: parameters.
@@ -124,8 +124,8 @@ def vehicle_rates(
 def rigid_body_rates(
     vehicle: VehicleParams, body: ndarray, force_w: ndarray, torque_b: ndarray
 ) -> ndarray:
-    """Return the time derivative of free bodies, shape (E, 13), under world force [N], gravity and
-    torque [N m].
+    """Return the time derivative of free bodies, shape (E, 13), under a force [N], world frame,
+    gravity and a torque [N m], body frame.
     """
     inertia = np.array(vehicle.body.inertia)
     rate = body[:, RATE]

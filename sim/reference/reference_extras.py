@@ -1,6 +1,4 @@
-"""Effects that the reference plant can show and the training simulator lacks; every one is off by
-default.
-"""
+"""Effects of the reference plant that the training simulator lacks. All are off by default."""
 
 from dataclasses import dataclass
 
@@ -9,16 +7,16 @@ from camera.field_bounds import BoundedFields, NotNegative, NotNegativeVector, P
 
 @dataclass(frozen=True)
 class ReferenceExtras(BoundedFields):
-    """Switchable effects of the reference plant.
+    """Optional effects of the reference plant.
 
-    Fields that end in ``_sigma`` are standard deviations of a normal draw at each reset, one an
-    environment; fields that end in ``_jitter`` are half-widths of a uniform draw at each event; the
-    others are values. Zero switches off."""
+    A field that ends in ``_sigma`` is the standard deviation of a normal draw for each environment
+    at each reset. A field that ends in ``_jitter`` is the half-width of a uniform draw at each
+    event. The others are values. Zero disables an effect."""
 
     # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
     payload_drag: NotNegative = 0.0
     wind_mean_w: Vector = (0.0, 0.0, 0.0)  # world frame [m/s]
-    # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
+    # of an Ornstein-Uhlenbeck process on each axis [m/s]; it also runs between resets
     wind_sigma_w: NotNegativeVector = (0.0, 0.0, 0.0)
     wind_time_constant: Positive = 1.0  # of that process [s]
     # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
@@ -27,9 +25,9 @@ class ReferenceExtras(BoundedFields):
     extra_joint_damping: NotNegative = 0.0  # added to RopeParams.joint_damping [N m s]
     com_offset: Vector = (0.0, 0.0, 0.0)  # centre of mass from the frame's origin, body frame [m]
     com_offset_sigma: NotNegativeVector = (0.0, 0.0, 0.0)  # [m]
-    thrust_gain_error: float = 0.0  # relative, all motors alike [-]
-    thrust_gain_sigma: NotNegative = 0.0  # relative, all motors alike [-]
-    motor_gain_sigma: NotNegative = 0.0  # relative, each motor for itself [-]
+    thrust_gain_error: float = 0.0  # relative, equal for all motors [-]
+    thrust_gain_sigma: NotNegative = 0.0  # relative, equal for all motors [-]
+    motor_gain_sigma: NotNegative = 0.0  # relative, independent for each motor [-]
     delay_jitter: NotNegative = 0.0  # of each command about QueueParams.delay [s]
     release_lag_jitter: NotNegative = 0.0  # about ReleaseParams.lag [s]
     mocap_position_sigma: NotNegative = 0.0  # each axis, each sample [m]

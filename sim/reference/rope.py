@@ -1,12 +1,12 @@
-"""Accelerations of quadrotors with ropes, and of ropes alone, from MuJoCo C.
+"""Accelerations of quadrotors with ropes, and of loose ropes, computed by MuJoCo C.
 
-The rope's state is the direction of every segment and its time derivative. In each evaluation
-MuJoCo is given ball joints that stand for these directions, without any axial spin: nothing drives
-a slender rod about its axis, so its spin stays zero, and the state holds no angle that could be
-singular. What comes back are angular accelerations.
+The rope's state consists of the direction of every segment and its time derivative. In each
+evaluation these are converted to MuJoCo's ball joints without axial spin. No force drives a slender
+rod about its axis, so its spin stays zero and the state needs no angle that could be singular.
+MuJoCo's angular accelerations are converted back.
 
-Joint damping is applied as couples ``-d (w_i - w_(i-1))`` between neighbours. A rod takes the part
-across its axis."""
+Joint damping is applied as couples ``-d (w_i - w_(i-1))`` between neighbours. Only the part
+perpendicular to a rod's axis acts on the rod."""
 
 import numpy as np
 from numpy import ndarray
@@ -28,7 +28,7 @@ RopeState = tuple[ndarray, ...]
 shapes (e,).
 """
 Motion = tuple[ndarray, ndarray, ndarray]
-"""Three quantities of a motion; the docstring of what takes or returns them names them."""
+"""Three quantities of a motion, as the docstrings of the functions define them."""
 
 
 class RopeDynamics:
@@ -36,10 +36,9 @@ class RopeDynamics:
 
     Args:
         body: of all vehicles.
-        ropes: one an environment, all with the same number of segments.
+        ropes: one for each environment, all with the same number of segments.
         stretch: stiffness [N/m] and damping [N s/m] between last segment and payload, or None.
-        mount_damping: of the uppermost joint besides the ropes' own while it is on the vehicle [N m
-            s].
+        mount_damping: additional damping of the joint at the mount while attached [N m s].
     """
 
     def __init__(
@@ -60,8 +59,8 @@ class RopeDynamics:
         attached = [build_attached(body, rope, "ball", stretch=stretch) for rope in ropes]
         self._attached = _bound_batch(attached)
         self._free = _bound_batch([build_free(rope, stretch=stretch) for rope in ropes])
-        # The payload is the last body; with stretch it is its own, else its force acts on the last
-        # rod by its arm.
+        # Forces on the payload act on the last body: with stretch the payload itself, else the last
+        # rod, with an arm.
         self._centre = np.array([-model.body_ipos[-1, 2] for model in attached])
 
     def accelerate_attached(
@@ -73,10 +72,10 @@ class RopeDynamics:
         rope: RopeState,
         force_w: ndarray,
     ) -> Motion:
-        """Return accelerations of quadrotors with their ropes.
+        """Return the accelerations of quadrotors with their ropes.
 
         Args:
-            ids: environments, shape (e,); every other argument has their rows only.
+            ids: environments, shape (e,); all other arguments have rows only for these.
             body: columns of ``quadrotor.BODY``, shape (e, 13).
             rotation: rot_wb, shape (e, 3, 3).
             wrench: force [N], world frame, and torque [N m], body frame, about the quadrotor's
@@ -102,11 +101,11 @@ class RopeDynamics:
         rope: RopeState,
         force_w: ndarray,
     ) -> Motion:
-        """Return accelerations of ropes alone: of the upper end, of the directions and of the
+        """Return the accelerations of loose ropes: of the upper end, of the directions and of the
         elongation.
 
         Args:
-            ids: environments, shape (e,); every other argument has their rows only.
+            ids: environments, shape (e,); all other arguments have rows only for these.
             root: position [m] and velocity [m/s] of the upper end, world frame, shapes (e, 3).
             force_w: on the payload's centre [N], shape (e, 3).
         """
@@ -131,7 +130,7 @@ class RopeDynamics:
             ids: environments.
             root: MuJoCo's coordinates and velocities above the rods.
             above: rotation, angular velocity and wrench of the body above the first rod, world
-                frame; MuJoCo ignores a wrench on the world.
+                frame. If this body is the world, MuJoCo ignores the wrench.
             upper_damping: of the first joint [N m s], shape (e,).
             force_w: on the payload's centre [N], shape (e, 3).
         """
@@ -174,16 +173,16 @@ class RopeDynamics:
         return qacc[:, :head], second, elongation
 
     def _couples(self, ids: ndarray, upper_damping: ndarray, relative: ndarray) -> ndarray:
-        """Return the friction of each joint on the rod below it [N m], shape (e, L, 3), from the
-        rods' rates relative to what they hang on [rad/s].
+        """Return the damping torque of each joint on the rod below it [N m], shape (e, L, 3), from
+        the rods' rates relative to the bodies above them [rad/s].
         """
         damping = np.tile(self.damping[ids, None], self.segments)
         damping[:, 0] = upper_damping
         return -damping[..., None] * relative
 
     def points(self, root_pos: ndarray, root_vel: ndarray, rope: RopeState) -> Motion:
-        """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and
-        velocity of the payload.
+        """Return upper end, joints and lower end of the rope [m], shape (E, L + 1, 3), and position
+        and velocity of the payload.
 
         Args:
             root_pos: upper end [m], shape (E, 3).
@@ -207,8 +206,8 @@ class RopeDynamics:
 
 
 def _bound_batch(models: list) -> tuple:
-    """Return a batch of models and its arrays of coordinates, velocities, wrenches and
-    accelerations; the last are written by each call of ``forward``.
+    """Return a batch of models with its arrays of coordinates, velocities, wrenches and
+    accelerations. Each call of ``forward`` overwrites the accelerations.
     """
     batch = Batch(models[0], len(models), nthread=1)
     batch.set_models(models)

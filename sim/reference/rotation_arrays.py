@@ -1,4 +1,4 @@
-"""Rotations in float64 NumPy: small functions over any leading axes."""
+"""Functions of rotations in float64 NumPy, for any leading axes."""
 
 import numpy as np
 from numpy import ndarray
@@ -8,15 +8,15 @@ _LAST = np.array([2, 0, 1])
 
 
 def cross(a: ndarray, b: ndarray) -> ndarray:
-    """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
-    vectors.
+    """Return the cross product over the last axis. For a few vectors it is many times faster than
+    ``np.cross``.
     """
     return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
 def length(vectors: ndarray) -> ndarray:
-    """Return the norm over the last axis, which stays; ``np.linalg.norm`` takes twice as long on a
-    few vectors.
+    """Return the norm over the last axis, which is kept with length 1. For a few vectors it is
+    twice as fast as ``np.linalg.norm``.
     """
     return np.sqrt(np.add.reduce(vectors * vectors, -1, keepdims=True))
 
@@ -48,8 +48,7 @@ def quat_dot(quat: ndarray, rate_b: ndarray) -> ndarray:
 
 
 def rotation_from_direction(direction_w: ndarray) -> ndarray:
-    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as
-    possible from hanging.
+    """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3).
 
     Args:
         direction_w: unit vectors, shape (..., 3).
@@ -73,8 +72,8 @@ def rotation_from_direction(direction_w: ndarray) -> ndarray:
 
 
 def _products(m: ndarray) -> ndarray:
-    """Four times the products of the components wxyz of the quaternions of rotation matrices, shape
-    (..., 4, 4).
+    """Return four times the products of the wxyz components of rotation matrices' quaternions,
+    shape (..., 4, 4).
     """
     xx = m[..., 0, 0]
     yy = m[..., 1, 1]
@@ -96,12 +95,12 @@ def _products(m: ndarray) -> ndarray:
 
 _OF_NONE = _products(np.zeros((3, 3))).ravel()
 _OF_ENTRIES = _products(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _OF_NONE
-"""The same as one product of matrices, which a few rotations take a tenth of the time for."""
+"""`_products` as a matrix product and an offset, ten times as fast for a few rotations."""
 
 
 def quat_wxyz_from_matrix(matrix: ndarray) -> ndarray:
-    """Return unit quaternions wxyz of rotation matrices, shape (..., 4), by the largest of the four
-    squares.
+    """Return unit quaternions wxyz of rotation matrices, shape (..., 4), computed from the largest
+    of the four components.
     """
     products = (matrix.reshape(-1, 9) @ _OF_ENTRIES + _OF_NONE).reshape(-1, 4, 4)
     largest = products[:, *np.diag_indices(4)].argmax(-1)

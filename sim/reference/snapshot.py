@@ -1,6 +1,4 @@
-"""What any plant says of its vehicles: their state at one time, and where their
-payloads came down.
-"""
+"""Records that every plant returns: the state of its vehicles and their payloads' landings."""
 
 from dataclasses import dataclass
 
@@ -19,7 +17,7 @@ class Snapshot:
     quat_wb: ndarray  # shape (E, 4)
     vel_w: ndarray  # [m/s], shape (E, 3)
     rate_b: ndarray  # [rad/s], shape (E, 3)
-    payload_pos_w: ndarray  # its centre [m], shape (E, 3); where it landed after landing
+    payload_pos_w: ndarray  # its centre [m], shape (E, 3); the landing point after landing
     payload_vel_w: ndarray  # [m/s], shape (E, 3)
     cable_points_w: ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
     motor_speed: ndarray  # [rad/s], shape (E, 4)
@@ -30,7 +28,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class PayloadLandings:
-    """Landing places and times of the payloads, on the plant's clock; NaN before the landing."""
+    """Landing points and times of the payloads, on the plant's clock; NaN before the event."""
 
     landed: ndarray  # shape (E,), bool
     point_w: ndarray  # of the payload's centre [m], shape (E, 3)

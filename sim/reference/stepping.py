@@ -1,9 +1,10 @@
-"""Steps from event to event of a control period, and Runge-Kutta steps of order 4 that halve
-themselves where a rope snaps.
+"""Division of a control period into steps between events, and adaptive Runge-Kutta steps of order
+4.
 
-A rope that snaps taut stiffens within a step: its transverse modes rise with the root of the
-tension. Each step reads the frequency that its own two middle stages show and how far a segment
-turned; environments beyond the limits repeat the step as two halves."""
+A rope that snaps taut stiffens within a step: the frequencies of its transverse modes are
+proportional to the square root of the tension. Each step estimates the frequency from its two
+middle stages, and the largest rotation of a segment. Environments in which one of them exceeds its
+limit repeat the step as two halves."""
 
 from collections.abc import Callable
 
@@ -15,8 +16,8 @@ from sim.reference.vehicle_blocks import TIME_TOLERANCE
 
 # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
 LARGEST_PHASE = 0.9
-# turn of a segment within one step beyond which it is halved [rad]; RK4 then errs by about 0.25^5 /
-# 120 = 8e-6 rad
+# rotation of a segment in one step beyond which the step is halved [rad]; the error of RK4 is then
+# about 0.25^5 / 120 = 8e-6 rad
 LARGEST_TURN = 0.25
 MOST_HALVINGS = 6
 
@@ -29,12 +30,12 @@ def halving_rk4(
     velocity: slice,
     depth: int = 0,
 ) -> ndarray:
-    """Take one step of order 4 in each environment, in halves, quarters .. where the rope asks for
-    it.
+    """Take one step of order 4 in each environment, divided into halves, quarters, ... where the
+    rope requires it.
 
     Args:
-        rates: function from state and step to the state's time derivative; rows with a step of 0
-            may stand still.
+        rates: function from state and step to the state's time derivative, which may be 0 in rows
+            with a step of 0.
         state: shape (E, N).
         step: [s], shape (E,).
         direction: columns of the segments' directions.
@@ -47,8 +48,8 @@ def halving_rk4(
     k3 = rates(state + 0.5 * h * k2, step)
     k4 = rates(state + h * k3, step)
     after = state + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-    # k2 and k3 belong to one time and to states 0.5 h (k2 - k1) apart: their ratio is the square of
-    # a frequency.
+    # k2 and k3 are evaluated at the same time, at states 0.5 h (k2 - k1) apart: the ratio of the
+    # differences is the square of a frequency.
     difference = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
     pull = length(k3[:, velocity] - k2[:, velocity])[:, 0]
     phase = step * np.sqrt(pull / np.maximum(difference, 1e-12))
@@ -65,15 +66,14 @@ def halving_rk4(
 
 
 def segments_of_period(edges: list[list[float]], step: float) -> ndarray:
-    """Cut the spans between events into equal steps.
+    """Divide the spans between events into equal steps.
 
     Args:
-        edges: times of the events of each environment in any order, start and end among them [s].
+        edges: times of each environment's events in any order, including start and end [s].
         step: largest step [s].
 
     Returns:
-        Steps [s], shape (E, S); zeros where an environment needs fewer than the one that needs
-        most.
+        Steps [s], shape (E, S), padded with zeros.
     """
     rows = []
     for times in edges:
@@ -96,7 +96,7 @@ def crossing(
     step: float,
     height: float,
 ) -> tuple[float, ndarray]:
-    """Find where a path passes a height going down, by the cubic through both ends of a step.
+    """Find where a path crosses a height downwards, by the cubic Hermite curve of a step.
 
     Args:
         pos_0: at the start of the step [m], shape (3,).

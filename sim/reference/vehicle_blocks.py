@@ -1,9 +1,9 @@
-"""The blocks of the vehicle and of the release in float64 NumPy, from the equations in the
-docstrings of ``sim.params``.
+"""Blocks of the vehicle and of the release in float64 NumPy, with the equations in the docstrings
+of ``sim.params``.
 
-Every function is pure and takes E environments at once. Body frame x forward, y left, z up; SI
-units. Suffix ``_dot`` is a time derivative. Written apart from the training simulator on purpose:
-it shares the equations, not the code."""
+Every function is pure and evaluates E environments. Body frame x forward, y left, z up; SI units.
+The suffix ``_dot`` denotes a time derivative. The code is deliberately independent of the training
+simulator's: they share only the equations."""
 
 from functools import lru_cache
 
@@ -25,7 +25,7 @@ from sim.params import (
 )
 from sim.reference.rotation_arrays import cross, length
 
-# of a row vector about z, without its z
+# rotates a row vector by a quarter turn about z and removes its z component
 _QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 # columns of the blocks' state
@@ -37,15 +37,15 @@ USED = 13  # fraction
 VOLTAGE = 14
 BLOCKS = 15
 
-# times closer than this are one event [s]; a control period of 20 ms has no finer structure
+# times closer than this are the same event [s]
 TIME_TOLERANCE = 1e-10
 
 
 def command_queue(times: ndarray, commands: ndarray, time: ndarray) -> ndarray:
-    """Return the command that acts at ``time``: the latest whose time has come.
+    """Return the command that acts at ``time``, the latest one that has started to act.
 
     Args:
-        times: when each command starts to act [s], shape (K, E), ascending along K; the first long
+        times: when each command starts to act [s], shape (K, E), ascending along K; the first is
             before ``time``.
         commands: collective thrust [N] and body rates [rad/s], shape (K, E, 4).
         time: [s], shape (E,).
@@ -56,14 +56,16 @@ def command_queue(times: ndarray, commands: ndarray, time: ndarray) -> ndarray:
 
 @lru_cache(maxsize=8)
 def _tilting(rotors: RotorParams) -> ndarray:
-    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4)."""
+    """Return the thrust of each motor for a unit torque of roll and of pitch [1/m], shape (2,
+    4).
+    """
     x = np.array(rotors.x)
     y = np.array(rotors.y)
     return np.stack((y / np.sum(y**2), -x / np.sum(x**2)))
 
 
 def _motor_shares(torque: ndarray, rotors: RotorParams, torque_ratio: float) -> ndarray:
-    """Thrust of each motor for roll, pitch and yaw [N], shape (E, 4)."""
+    """Return the thrust of each motor for a torque about roll, pitch and yaw [N], shape (E, 4)."""
     yaw = np.array(rotors.spin) / (4.0 * torque_ratio)
     return torque[:, :2] @ _tilting(rotors) + torque[:, 2:] * yaw
 
@@ -76,31 +78,31 @@ def mixer(
     f_min: float,
     f_max: ndarray,
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """Share collective thrust and torque out to the motors; yaw gives way first, then roll and
-    pitch.
+    """Distribute collective thrust and torque to the motors. At saturation yaw is reduced first,
+    then roll and pitch.
 
     Args:
         thrust: [N], shape (E,).
         torque: [N m], shape (E, 3).
         rotors: geometry.
         torque_ratio: nominal kappa [m].
-        f_min: least thrust a motor [N].
-        f_max: largest thrust a motor [N], shape (E,).
+        f_min: least thrust of a motor [N].
+        f_max: largest thrust of a motor [N], shape (E,).
 
     Returns:
         Thrusts [N], shape (E, 4); delivered share of roll and pitch and of yaw, 0 to 1, shapes
         (E,).
 
-    Convention: yaw takes the largest part of the demand that keeps the spread of the four within
-    the limits."""
+    Convention: yaw gets the largest part of the demand with which the range of the four thrusts
+    stays within the limits."""
     spin = np.array(rotors.spin)
     tilt = torque[:, :2] @ _tilting(rotors)
     room = f_max - f_min
     extent = tilt.max(axis=1) - tilt.min(axis=1)
     scale = np.minimum(room / np.maximum(extent, 1e-300), 1.0)
     tilt = tilt * scale[:, None]
-    # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between
-    # the two kinds only.
+    # Yaw y raises the motors of one spin by y and lowers the others, so that only differences
+    # between the two kinds change, by 2 y.
     rising = tilt[:, spin > 0.0]
     falling = tilt[:, spin < 0.0]
     highest = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
@@ -131,8 +133,8 @@ def _pid_torque(
 def betaflight(
     vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro,
-    feed-forward and mixer.
+    """Compute the rate controller with set-point filter, P, I with anti-windup, D on a filtered
+    gyro, feed-forward and mixer.
 
     Args:
         vehicle: parameters.
@@ -168,10 +170,10 @@ def betaflight(
 def motor_mixing(
     vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Rate controller that mixes motor commands and relaxes its integral; arguments and result as
-    of :func:`betaflight`.
+    """Compute the rate controller that mixes motor commands and relaxes its integral; arguments and
+    result as for :func:`betaflight`.
 
-    The filtered set-point is the low-pass of the command's rates."""
+    The state's set-point is the low-pass filtered rate command."""
     gains = vehicle.controller
     low, gyro, integral = np.hsplit(state[:, : INTEGRAL.stop], 3)
     rate_command = command[:, 1:]
@@ -200,7 +202,9 @@ def motor_mixing(
 def geometric(
     vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
 ) -> tuple[ndarray, float]:
-    """Simple rate controller, whose filters stand still; arguments as of :func:`betaflight`."""
+    """Compute the proportional rate controller without filters; arguments as for
+    :func:`betaflight`.
+    """
     gains = vehicle.controller
     inertia = np.array(vehicle.body.inertia)
     torque = gains.geometric_gain * inertia * (command[:, 1:] - rate) + cross(rate, inertia * rate)
@@ -213,9 +217,7 @@ CONTROLLERS = {"betaflight": betaflight, "motor_mixing": motor_mixing, "geometri
 
 
 def motor(params: MotorParams, speed: ndarray, setpoint: ndarray) -> ndarray:
-    """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at
-    once.
-    """
+    """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero for ``instant``."""
     if params.kind == "instant":
         return np.zeros_like(speed)
     slowing = params.time_constant_down if params.kind == "asymmetric" else params.time_constant
@@ -261,7 +263,7 @@ def thrust_map(
         reference_voltage: u_ref [V].
         speed: [rad/s], shape (E, 4).
         voltage: [V], shape (E,).
-        gain: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
+        gain: factor on each motor's thrust in addition to ``params.gain``, shape (E, 4).
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
     thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None]
@@ -270,8 +272,8 @@ def thrust_map(
 
 
 def drag_torque_ratio(params: ThrustParams) -> float:
-    """Return a rotor's true ratio of drag torque to thrust [m]; the controller's mixer knows of the
-    nominal one.
+    """Return a rotor's true ratio of drag torque to thrust [m]. The controller's mixer uses the
+    nominal ratio.
     """
     return params.torque_ratio * params.torque_gain
 
@@ -295,7 +297,7 @@ def aerodynamics(
     air_velocity_b: ndarray,
     rate: ndarray,
 ) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Return what the relative air adds.
+    """Return the aerodynamic forces and torques.
 
     Args:
         params: coefficients.
@@ -335,11 +337,11 @@ def composer(
     rate: ndarray,
     aero: tuple[ndarray, ndarray, ndarray, ndarray],
 ) -> tuple[ndarray, ndarray]:
-    """Add up the body wrench about the centre of mass.
+    """Add up the wrench on the body about the centre of mass.
 
     Returns the force [N] and torque [N m], body frame, shapes (E, 3).
 
-    Convention: the change of thrust by inflow enters the force as well as the torque.
+    Convention: the change of thrust by inflow contributes to the force and to the torque.
     """
     drag, flapping, thrust_change, torque_change = aero
     lift = thrust + thrust_change
@@ -389,5 +391,5 @@ def release_lag(params: ReleaseParams, pull: ndarray, payload_mass: ndarray) -> 
 
 
 def release_kick(params: ReleaseParams, along_w: ndarray) -> ndarray:
-    """Return the speed that the mechanism gives [m/s], shape (E, 3); the rope shares it."""
+    """Return the change of velocity by the mechanism [m/s], shape (E, 3), for rope and payload."""
     return params.kick_w + params.kick_along * along_w

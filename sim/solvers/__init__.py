@@ -1,7 +1,8 @@
-"""Solvers that hold the bodies of the hybrid simulator: vehicle, rope and payload.
+"""Solvers for the bodies of the hybrid simulator: vehicle, rope and payload.
 
-The fused kernel of :mod:`sim.kernels.step` needs none. Any other engine is a :class:`Solver`; what
-it exchanges with the quadrotor's blocks in every substep is a wrench and the root's kinematics."""
+The fused kernel of :mod:`sim.kernels.step` integrates the bodies itself. Any other engine is a
+:class:`Solver`. In every substep the quadrotor's blocks give it a wrench, and it returns the
+bodies' kinematics."""
 
 import importlib
 import math
@@ -26,14 +27,14 @@ SOLVERS = {
 """Name in ``sim.solver`` -> class; ``chain`` is the fused kernel."""
 
 UNKNOWN = frozenset({"compliance", "lag_tension", "rope_tail"})
-"""Extensions that no solver behind the exchange knows."""
+"""Extensions that only the fused kernel supports."""
 
 
 class Solver(Protocol):
     """An engine that advances the bodies of E vehicles on the device.
 
     Attributes:
-        capturable: whether its work may be captured in a CUDA graph.
+        capturable: whether its steps can be captured in a CUDA graph.
     """
 
     capturable: bool
@@ -41,17 +42,17 @@ class Solver(Protocol):
     def __init__(self, world: "World"):
         """Build the bodies.
 
-        Raises ValueError: something that the engine cannot hold; ModuleNotFoundError: it is not
-        installed.
+        Raises ValueError: a plant that the engine cannot simulate; ModuleNotFoundError: the engine
+        is not installed.
         """
 
     def place(self, mask: "wp.array[Any]") -> None:
-        """Put the bodies to ``world.state`` where ``mask``, shape (E,), int, is not 0.
+        """Set the bodies to ``world.state`` where ``mask``, shape (E,), int, is not 0.
 
-        ``world.bodies`` shows them already, with the payload in line with the rope."""
+        ``world.bodies`` already contains this state, with the payload in line with the rope."""
 
     def advance(self, duration: float) -> None:
-        """Advance all bodies under ``world.wrench`` [s], and show them in ``world.bodies``."""
+        """Advance all bodies under ``world.wrench`` by ``duration`` [s]; write ``world.bodies``."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,10 @@ class World:
     device: str
     types: Types
     vehicles: Sequence[VehicleParams]  # of environment e: e % len(vehicles)
-    ropes: Sequence[RopeParams]  # likewise; mounts are stated from the centre of mass
-    plants: Any  # the same on the device, with the numerics: types.Plants
+    ropes: Sequence[RopeParams]  # likewise; mounts are relative to the centre of mass
+    plants: Any  # these parameters on the device, with the numerics: types.Plants
     state: Any  # arrays of sim.kernels.state.STATE_FIELDS
-    kernels: ExchangeKernels  # whose structs the arrays are in
+    kernels: ExchangeKernels  # with the types of the structs
     wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
     bodies: Any  # of sim.kernels.exchange.BODY_FIELDS
 
@@ -81,12 +82,14 @@ class World:
 
     @property
     def substeps(self) -> int:
-        """Number of exchanges a control period."""
+        """Number of exchanges in a control period."""
         s = self.params.sim
         return math.ceil(s.control_period / s.substep - 1e-3)
 
     def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], ndarray]:
-        """Different pairs of vehicle and rope, and which of them each environment has."""
+        """Return the distinct pairs of vehicle and rope, and the index of the pair of each
+        environment.
+        """
         period = math.lcm(len(self.vehicles), len(self.ropes))
         rows = range(min(period, self.count))
         pairs = [
@@ -101,15 +104,15 @@ class World:
 
 
 class Exchange:
-    """Steps of a simulator whose bodies are a solver's.
+    """Steps of a simulator whose bodies are integrated by a solver.
 
-    Raises ValueError: a plant that has something which cannot be exchanged.
+    Raises ValueError: a plant that the solver cannot simulate.
     """
 
     def __init__(
         self, kernels: ExchangeKernels, world: dict[str, Any], build: Callable[[World], Solver]
     ):
-        """Build the solver; ``world``: what :class:`World` is made of but the shared arrays."""
+        """Build the solver; ``world``: the fields of :class:`World` except the shared arrays."""
         count = world["count"]
         device = world["device"]
         segments = world["params"].rope.segments
@@ -141,7 +144,7 @@ class Exchange:
         self.place(launch, sim, flags.redrawn)
 
     def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
-        """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
+        """Set the solver's bodies to the state arrays where ``mask`` is not 0."""
         w = self.world
         launch(w.kernels.show, [w.plants, sim.state, mask, w.bodies, w.wrench])
         self.solver.place(mask)
@@ -149,14 +152,14 @@ class Exchange:
 
 
 def solver_class(name: str) -> type[Solver]:
-    """Class of a solver by its name in :data:`SOLVERS`."""
+    """Return the class of a solver by its name in :data:`SOLVERS`."""
     module, _, attribute = SOLVERS[name].partition(":")
     solver: type[Solver] = getattr(importlib.import_module(module), attribute)
     return solver
 
 
 def refuse(extensions: frozenset[str], params: PlantParams) -> None:
-    """Raise ValueError for what of a plant cannot be exchanged with a solver."""
+    """Raise ValueError if the plant's solver does not support all of its parameters."""
     name = params.sim.solver
     if name != "mujoco_warp":
         params.rope.require_chain(f"sim.solver {name!r}")

@@ -1,4 +1,6 @@
-"""Solver that runs the fused kernel's chain behind the exchange, to measure its cost."""
+"""Solver that runs the fused kernel's chain through the exchange, to measure the exchange's
+cost.
+"""
 
 import warp as wp
 
@@ -22,7 +24,7 @@ class ChainSolver:
         self._kernel = _kernel(world)
 
     def place(self, mask) -> None:
-        """Nothing is to be done: all that it keeps are the arrays of the state."""
+        """Do nothing: the bodies are in the state's arrays."""
 
     def advance(self, duration: float) -> None:
         w = self.world
@@ -31,7 +33,7 @@ class ChainSolver:
 
 
 def _kernel(world: World) -> wp.Kernel:
-    """Kernel that advances the bodies of a world."""
+    """Build the kernel that advances the bodies of a world."""
     t = world.types
     L = world.params.rope.segments
     real = t.real
@@ -47,7 +49,7 @@ def _kernel(world: World) -> wp.Kernel:
 
     @wp.func
     def flow(p: t.Vehicle, air: Air, s: QuadState, command: vec4):
-        """The wrench that was given: here the air carries its force in the body frame."""
+        """Return the exchanged wrench, which ``air`` holds with its force in the body frame."""
         out = t.QuadRate()
         out.pos_w = s.vel_w
         out.quat_wb = quat_rate(s.quat_wb, s.rate_b)

@@ -1,8 +1,7 @@
-"""MuJoCo behind the exchange: MuJoCo Warp on a GPU, MuJoCo's C library, which takes the same
-models, on a CPU.
+"""MuJoCo as a solver: MuJoCo Warp on a GPU, and MuJoCo's C library with the same models on a CPU.
 
-RK4 up to a substep of 0.5 ms, where it has converged on the paper's rope; implicitfast above, where
-RK4 is unstable."""
+The integrator is RK4 for substeps up to 0.5 ms, at which it has converged for the paper's rope, and
+implicitfast for larger ones, at which RK4 is unstable."""
 
 from collections.abc import Callable
 
@@ -17,7 +16,7 @@ from sim.solvers.payloads import compile_model
 from sim.solvers.rods import Ints, Table, build_place, quat, read, vec3, write
 
 RK4_STEP = 5e-4
-"""Largest substep of RK4 [s]: half of it moves a hard throw's end by less than a micrometre."""
+"""Largest substep of RK4 [s]. Half of it changes the end of a hard throw by less than 1 um."""
 
 MODEL_ARRAYS = (
     "body_pos",
@@ -33,14 +32,14 @@ MODEL_ARRAYS = (
     "tendon_invweight0",
     "tendon_length0",
 )
-"""Fields of a model in which vehicles and ropes of one batch may differ."""
+"""Fields of a model that may differ between the vehicles and ropes of a batch."""
 
 CONSTRAINTS = 8
-"""Room for constraints of a world: cables that are taut."""
+"""Largest number of constraints (taut cables) in a world."""
 
 
 class MujocoSolver:
-    """Copies of MuJoCo's models, one a vehicle."""
+    """A MuJoCo model for each vehicle."""
 
     capturable = False  # on a GPU a step is a captured graph of its own
 
@@ -100,9 +99,10 @@ class MujocoSolver:
 
 
 def _make_on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
-    """Batch of MuJoCo's C library: arrays of coordinates, controls and masses, functions that step
-    and that take over what was placed where a mask is not 0.
-    """
+    """Make a batch of MuJoCo's C library.
+
+    Returns arrays of coordinates, velocities, controls and masses, a function that steps, and one
+    that applies newly placed coordinates where a mask is not 0."""
     from sim.reference.batch import Batch
 
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # NaN must remain visible
@@ -130,7 +130,7 @@ def _make_on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tu
 
 
 def _make_on_gpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
-    """MuJoCo Warp's worlds: see :func:`_make_on_cpu`."""
+    """Make MuJoCo Warp's worlds; see :func:`_make_on_cpu`."""
     import mujoco_warp
 
     with wp.ScopedDevice(device), wp.ScopedStream(wp.Stream(device)):
@@ -138,12 +138,12 @@ def _make_on_gpu(model, wide: dict[str, ndarray], count: int, device: str) -> tu
         for name, value in wide.items():
             getattr(model_on_device, name).assign(value.astype(np.float32))
         data = mujoco_warp.make_data(model, nworld=count, njmax=CONSTRAINTS, naconmax=1)
-        mujoco_warp.step(model_on_device, data)  # modules load, which a capture cannot
+        mujoco_warp.step(model_on_device, data)  # loads modules, which a capture cannot
         with wp.ScopedCapture(device=device, force_module_load=False) as captured:
             mujoco_warp.step(model_on_device, data)
         wp.synchronize_device(device)
 
-    # the graph reads these, and must not outlive them
+    # the default argument keeps these alive as long as the graph, which reads them
     def step(_read=(model_on_device, data)) -> None:
         wp.capture_launch(captured.graph, stream=wp.get_stream(device))
 
@@ -166,13 +166,13 @@ def _clear(
 
 
 def _kernels(world: World) -> dict[str, Callable]:
-    """Kernels between the exchange's arrays and MuJoCo's coordinates."""
+    """Build the kernels that convert between the exchange's arrays and MuJoCo's coordinates."""
     t = world.types
     rope = world.params.rope
     L = rope.segments
     cables = rope.cables_apart > 0.0
     box = any(rope.payload_sides)
-    N = L + 1 if box else L  # the box turns like one more rod
+    N = L + 1 if box else L  # the box has joints like one more rod
     Rope = t.Rope
     State = world.kernels.State
     Wrench = world.kernels.Wrench

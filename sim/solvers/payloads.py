@@ -1,6 +1,7 @@
-"""MuJoCo's models of what may hang below a vehicle: :mod:`sim.reference.model` has the rope.
+"""MuJoCo models of vehicles with other payloads than the rope and ball of
+:mod:`sim.reference.model`.
 
-A ball on the rope; a box on it; a box on two cables; a gripper at the end of rope or rod."""
+A ball or a box on the rope; a box on two cables; a gripper at the end of the rope."""
 
 import mujoco
 
@@ -16,10 +17,10 @@ from sim.reference.model import (
 
 
 def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
-    """Compile a vehicle on a free joint with its rope and payload, as the rope's parameters say.
+    """Compile a vehicle on a free joint with the rope and payload of the rope's parameters.
 
-    Six actuators push the vehicle in its own frame, three more the payload at the site ``payload``
-    in its own.
+    Six actuators apply force and torque to the vehicle in its frame. Three more apply a force to
+    the payload at the site ``payload``, in the payload's frame.
     """
     spec = new_spec(constraints=rope.cables_apart > 0.0)
     vehicle = add_vehicle(spec, body)
@@ -41,12 +42,12 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
 
 
 GRIPPER_INERTIA = 1e-8
-"""Of a gripper about its own centre [kg m^2]: it counts as a point."""
+"""Inertia of a gripper about its centre [kg m^2], so small that it is a point mass."""
 
 
 def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: RopeParams) -> None:
-    """Add a box on two cables without mass, side by side along the vehicle's x axis; a cable pulls
-    or is slack.
+    """Add a box on two massless cables side by side along the vehicle's x axis. The cables are
+    inextensible and may be slack.
     """
     x, y, z = rope.mount
     box = spec.worldbody.add_body(name="box", pos=[x, y, z - rope.length - rope.payload_offset])
@@ -64,8 +65,8 @@ def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: Rope
 
 
 def _set_box_inertia(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
-    """Give a body a homogeneous box's inertia about a centre on its z axis, and the site
-    ``payload`` there.
+    """Give a body the inertia of a homogeneous box with its centre on the z axis, and add the site
+    ``payload`` at this centre.
     """
     a, b, c = (side * side for side in rope.payload_sides)
     twelfth = rope.payload_mass / 12.0

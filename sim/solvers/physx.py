@@ -1,7 +1,7 @@
-"""PhysX, the solver of the paper, behind the exchange: ovphysx, on a CPU or a GPU.
+"""PhysX, the paper's engine, as a solver: ovphysx on a CPU or a GPU.
 
-One articulation a vehicle: the body, and rods on joints with two angles, without colliders. What
-each setting is for: docs/explanation/physx.md."""
+Each vehicle is an articulation of the body and rods on joints with two angles, without colliders.
+docs/explanation/physx.md explains the settings."""
 
 import tempfile
 import weakref
@@ -63,11 +63,11 @@ DRIVE = """        float drive:{0}:physics:damping = {1!r}
         float drive:{0}:physics:stiffness = 0"""
 
 _device: list[str] = []
-"""Device of this process' PhysX, once it has run."""
+"""Device on which this process runs PhysX; empty before the start."""
 
 
 def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
-    """USD text of one vehicle with its rope, level and hanging straight down."""
+    """Return the USD text of a level vehicle with its rope hanging straight down."""
     length = rope.segment_length
     mount = rope.mount
     body = vehicle.body
@@ -100,7 +100,7 @@ def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
 class PhysxSolver:
     """Articulations of E vehicles in one scene.
 
-    Raises RuntimeError: PhysX runs on another device in this process already.
+    Raises RuntimeError: this process already runs PhysX on another device.
     """
 
     capturable = False
@@ -132,16 +132,16 @@ class PhysxSolver:
         wait(self._physx.attach_ovstage(stage, read_ordinal=1))
         for k, e in enumerate(first):
             copies = [f"/{name(c)}" for c in np.flatnonzero(model_of == k) if c != e]
-            if copies:  # nothing collides, so all may stand in one place
+            if copies:  # all at the same position, because there are no collisions
                 wait(self._physx.clone(f"/{name(e)}", copies, [(0.0,) * 6 + (1.0,)] * len(copies)))
         weakref.finalize(self, self._physx.destroy)
-        self._physx.warmup()  # a first step, which the first read or write would make
+        self._physx.warmup()  # a first step, which otherwise the first read or write would do
         self._bind(TensorType)
         self._kernels = _kernels(world)
         self._unscaled = self._masses[:, 0].copy()
 
     def _bind(self, kind) -> None:
-        """Tensors of the scene, and arrays to exchange them by."""
+        """Bind the scene's tensors, and allocate arrays to read and write them."""
         kinds = {
             "pose": kind.ARTICULATION_ROOT_POSE,
             "velocity": kind.ARTICULATION_ROOT_VELOCITY,
@@ -202,7 +202,7 @@ class PhysxSolver:
 
 
 def _start(device: str) -> ModuleType:
-    """Start PhysX in this process, on one device for good."""
+    """Start PhysX in this process; the device cannot be changed afterwards."""
     import ovphysx
     import ovstage
     from ovphysx.samples.python_samples.schema_support import physx_schema_paths
@@ -210,7 +210,7 @@ def _start(device: str) -> ModuleType:
 
     if not _device:
         ovphysx.PhysX.set_cpu_mode(device == "cpu")
-        if device == "cpu":  # its default of 8 makes a step of one vehicle 12 times as dear
+        if device == "cpu":  # the default of 8 makes a step of one vehicle 12 times as slow
             ovphysx.set_global_config(GlobalConfigKey.NUM_THREADS, 0)
         schemas = [*map(str, physx_schema_paths()), str(ovphysx.newton_schema_root())]
         ovstage.population.register_usd_schemas(schemas)
@@ -224,7 +224,7 @@ def _start(device: str) -> ModuleType:
 
 
 def _instance(ovphysx: ModuleType, device: str) -> Any:
-    """Make an instance in which nothing collides, and whose state stays on its GPU."""
+    """Make an instance without collisions, whose state stays on its GPU."""
     gpu = device != "cpu"
     settings = {"/ovphysx/clone/useEnvIds": False, "/physics/suppressReadback": gpu}
     physx = ovphysx.PhysX(config=ovphysx.PhysXConfig(carbonite_overrides=settings))
@@ -234,7 +234,7 @@ def _instance(ovphysx: ModuleType, device: str) -> Any:
 
 
 def _kernels(world: World) -> dict[str, wp.Kernel]:
-    """Kernels between the exchange's arrays and PhysX's tensors."""
+    """Build the kernels that convert between the exchange's arrays and PhysX's tensors."""
     t = world.types
     L = world.params.rope.segments
     Wrench = world.kernels.Wrench
@@ -250,7 +250,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         # Out:
         out: wp.array3d(dtype=float),
     ):
-        """Wrenches in the world frame, which PhysX holds over the step; none on broken bodies."""
+        """Write wrenches in the world frame, constant over PhysX's step; 0 for invalid bodies."""
         row = wp.tid()
         env = rows[row]
         q = bodies.quat_wb[env]

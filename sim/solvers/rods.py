@@ -1,4 +1,4 @@
-"""Rods on joints with two angles, as engines of rigid bodies have them in place of the chain."""
+"""The rope as rods on joints with two angles, for rigid-body engines."""
 
 import warp as wp
 
@@ -10,31 +10,31 @@ quat = wp.quatf
 Table = wp.array2d(dtype=float)
 
 AXIAL_INERTIA = 1e-8
-"""Of a rod about its axis [kg m^2]. Its joints pass the vehicle's yaw on, a cord does not: it must
-not load the vehicle; 1e-9 and 1e-10 move nothing more."""
+"""Inertia of a rod about its axis [kg m^2]. The joints transmit the vehicle's yaw, unlike a cord,
+so it must be negligible for the vehicle; 1e-9 and 1e-10 give the same motion."""
 
 
 @wp.func
 def read(table: Table, row: int, column: int):
-    """Vector from three columns of a row."""
+    """Return the vector in three columns of a row."""
     return vec3(table[row, column], table[row, column + 1], table[row, column + 2])
 
 
 @wp.func
 def write(table: Table, row: int, column: int, vector: vec3):
-    """Put a vector into three columns of a row."""
+    """Write a vector to three columns of a row."""
     for k in range(3):
         table[row, column + k] = vector[k]
 
 
 def build_place(world: World, hinges: bool) -> wp.Kernel:
-    """Build the kernel that turns state arrays into an engine's coordinates where a mask is not 0.
+    """Build the kernel that converts state arrays to an engine's coordinates where a mask is not 0.
 
-    It fills in poses (E, 7) and velocities (E, 6) of the roots, and angles and their rates
-    (E, 2 L). A joint's two angles are a rotation vector in its x-y plane, and their rates lie in
-    that plane of the lower rod; quaternions are xyzw, angular velocities in the world frame. With
-    ``hinges``, as MuJoCo has them, a rod turns by the angles about y, then about x, quaternions are
-    wxyz and the roots' angular velocities in the body frame. Environment ``rows[r]`` has row r.
+    It writes poses (E, 7) and velocities (E, 6) of the roots, and joint angles and their rates
+    (E, 2 L). A joint's two angles are a rotation vector in its x-y plane, and their rates are in
+    this plane of the lower rod; quaternions are xyzw, angular velocities in the world frame. With
+    ``hinges``, MuJoCo's convention, a rod is rotated about y, then about x; quaternions are wxyz
+    and the roots' angular velocities in the body frame. Environment ``rows[r]`` has row r.
     """
     L = world.params.rope.segments
     State = world.kernels.State
@@ -42,7 +42,7 @@ def build_place(world: World, hinges: bool) -> wp.Kernel:
 
     @wp.func
     def turned(d: vec3):
-        """Angles of the joint that turns -z into a direction, and the rotation."""
+        """Return the joint's angles that rotate -z into a direction, and the rotation."""
         if wp.static(hinges):
             b = wp.asin(wp.clamp(d[1], -1.0, 1.0))
             a = wp.atan2(-d[0], -d[2])
