@@ -95,12 +95,12 @@ class TrainLog:
         self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
-        remaining = round(self._estimate_remaining(figures["iteration"], elapsed))
+        remaining = self._estimate_remaining(figures["iteration"], elapsed)
         text = (
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
             f" {timedelta(seconds=round(figures['wall_s']))},"
-            f" {timedelta(seconds=remaining)} left"
+            f" {timedelta(seconds=round(remaining))} left"
         )
         if throws is not None:
             text += (

@@ -141,8 +141,11 @@ class Trainer:
         self.seconds["rollout"] += rollout
         self.seconds["learning"] += learning
         self.iteration += 1
-        times = {"rollout_s": rollout, "learning_s": learning}
-        return figures | times | {"iteration": self.iteration}
+        return figures | {
+            "rollout_s": rollout,
+            "learning_s": learning,
+            "iteration": self.iteration,
+        }
 
     def _check_losses(self, figures: dict[str, float]) -> None:
         """Raise TrainError if a loss or spread is not finite in any process."""

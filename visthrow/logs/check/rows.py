@@ -31,7 +31,7 @@ def worst(rows: list[Row]) -> Verdict:
 
 @dataclass(frozen=True)
 class KnownVehicle:
-    """What a model states about a vehicle."""
+    """Facts that a model states about a vehicle."""
 
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
     mass: float = 0.0  # of vehicle, cable and payload [kg]; 0: unknown
