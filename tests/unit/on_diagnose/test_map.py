@@ -347,6 +347,7 @@ def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     both = propose(grams, file.name, mass=36.9)  # 41 kgf carry it as well as 41 gf carry 36.9 g
     assert asks(both, "36.9 kg and 'ctrlLee.thrustSI' is in kgf, or 36.9 g and gf?")
     apart = {name: cells for name, cells in table_of(file).items() if not name.startswith("acc")}
+    assert propose(apart, file.name, mass=0.05).flyer["thrust_map"] == [0.0, 1.0, 0.0]
     apart["ctrlLee.thrustSI"] = 1e3 * apart["ctrlLee.thrustSI"]
     strange = propose(apart, file.name, mass=4.0)
     assert asks(strange, "no unit explains that")
@@ -495,19 +496,19 @@ def fly_by_motors(columns: dict[str, np.ndarray], motors: np.ndarray, name: str)
 def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     """By the speeds of the rotors, which have no lag; by pulses, which begin at 1000 us."""
     columns = flight(20.0)
-    share = columns["command"][:, 0] / np.max(columns["command"][:, 0])
+    true = columns["command"][:, 0]
+    share = true / np.max(true)
     motors = counts(share) if counts is not None else 1000.0 + 900.0 * share
     table = fly_by_motors(columns, motors, name)
     proposal = propose(table, "a.csv", mass=0.2)
     (log,) = logs_of(table, proposal.mapping, "a.csv")
-    thrust = model_thrust(log, proposal)
-    assert np.median(thrust) == approx(0.2 * 9.81, rel=0.1)
-    assert thrust / np.median(thrust) == approx(share / np.median(share), rel=1e-3)
+    assert model_thrust(log, proposal) == approx(true, rel=0.02)
     assert proposal.flyer["motor_time_constant"] == tau
     del columns["command"]
     outputs = Channel(columns["time"], np.tile(motors, (4, 1)).T, "1", "none")
     log = log_of(columns, motor_output=outputs)  # of an autopilot, which needs no mapping
-    assert np.median(model_thrust(log, propose_model(log, 0.2))) == approx(0.2 * 9.81, rel=0.1)
+    thrust = model_thrust(log, propose_model(log, 0.2))
+    assert np.mean(thrust) == approx(np.mean(true), rel=0.02)
     with raises(LogError, match="needs pos_w, quat_wb and one of"):
         propose_model(log_of(columns))
 

@@ -223,7 +223,7 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     Raises LogError: the weighed mass fits the thrust in grams, but not in kilograms.
     """
     entry = proposal.mapping.entry("thrust_command")
-    carried = _carried_mass(log)
+    carried = thrust_checks.mass_of(log)
     heavy = weighed is not None and weighed >= 1e3 * LIGHTEST  # perhaps grams
     if entry is None or carried is None:
         if heavy:
@@ -289,21 +289,6 @@ def _doubt_of_mass(off: float, hangs: bool) -> str:
     return ""
 
 
-def _carried_mass(log: FlightLog) -> float | None:
-    """Return the mass that a thrust in newtons carries, by the accelerometer or at the usual thrust
-    of the flight [kg]; None without a thrust.
-    """
-    if (mass := thrust_checks.mass_of(log)) is not None or "thrust_command" not in log:
-        return mass
-    usual = _usual(log["thrust_command"].samples().values)
-    return usual / physics.GRAVITY if usual > 0.0 else None
-
-
-def _usual(total: ndarray) -> float:
-    """Middle of a thrust while it flies."""
-    return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
-
-
 def _find_input(log: FlightLog, proposal: MappingProposal) -> str:
     """Return the input that the force follows best, or "" if that cannot be determined."""
     inputs = [name for name in thrust_checks.INPUTS if name in log]
@@ -326,12 +311,12 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     """Return parameters of a flying model: the thrust is scaled to carry the vehicle, others are
     those of a small quadrotor.
     """
-    applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_find_input(log, proposal)))
-    if applied is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
+    vehicle = KnownVehicle(thrust_input=_find_input(log, proposal))
+    applied = thrust_checks.thrust_of(log, vehicle)
+    carried = thrust_checks.thrust_over_force(log, vehicle)
+    if applied is None or carried is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
         return None
-    name, (_, total) = applied
-    if np.median(total) <= 0.0:
-        return None
+    name = applied[0]
     mass = thrust_checks.mass_of(log)
     path = log["pos_w"].samples()
     length = 0.0
@@ -339,8 +324,6 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         payload = log["payload_pos_w"].samples()
         gap = payload.values - path.at(payload.time)
         length = float(np.median(np.linalg.norm(gap, axis=1)))
-    motors = 1 if name in ("thrust_command", "throttle") else 4
-    hover = _usual(total) / motors
     share = 0.85 if length else 1.0  # mass of the vehicle over the total, until both are weighed
     whole = weighed / share if weighed else mass or 1.0
     hanging = (1.0 - share) * whole
@@ -353,7 +336,9 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     if length:
         proposal.questions.append(f"what does the payload weigh? {hanging:.3g} kg is a guess")
     newtons = mass is not None and name in ("command", "thrust_command")
-    first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
+    first = whole / carried[0]
+    if newtons and abs(np.log(first)) < thrust_checks.MASS_BAD:
+        first = 1.0
     measured = name == "motor_speed"  # measured behind the motors' lag
     power = [0.0, 0.0, first] if measured else [0.0, first, 0.0]
     if name in thrust_checks.PULSES and thrust_checks.are_pulses(log[name].values):

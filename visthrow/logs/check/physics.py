@@ -39,7 +39,7 @@ FIRMLY = 0.7
 CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
-_DELAY_BAD = 0.05
+DELAY_BAD = 0.05
 LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
 _RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
 DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
@@ -266,7 +266,7 @@ def _report_delay(
         f" {1e3 * relation.delay_sd:.1f} ms)"
     )
     large = (
-        abs(relation.delay) > _DELAY_BAD
+        abs(relation.delay) > DELAY_BAD
         and relation.delay_sd < 0.3 * abs(relation.delay)
         and relation.correlation > FIRMLY
     )
@@ -473,7 +473,7 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
     """Compare level forces at delays of an attitude and an accelerometer of one clock, which may be
     late beside the path; None where too few samples are known, or nothing moves sideways.
     """
-    reach = 2.0 * _DELAY_BAD  # half of that refuses a log
+    reach = 2.0 * DELAY_BAD  # half of that refuses a log
     first = force_b.time[0] + _SPAN + reach
     last = force_b.time[-1] - _SPAN - reach
     known = np.flatnonzero((acc.time > first) & (acc.time < last))
@@ -500,7 +500,7 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
             best = Samples(grid, expected), Samples(grid, measured)
     if best is None:
         return None
-    return _LevelForces(plain, turned, mirrored, size, relations.relate(*best, reach=_DELAY_BAD))
+    return _LevelForces(plain, turned, mirrored, size, relations.relate(*best, reach=DELAY_BAD))
 
 
 def _report_turned_body(
@@ -647,7 +647,7 @@ def _report_early_rates(
     """Report rates that go before their commands: if no delay that a controller has fits them as
     well, the clock of the commands is late. A swing that a controller opposes fits both.
     """
-    if relation.axes_delay > -_DELAY_BAD or relation.axes_correlation < FIRMLY:
+    if relation.axes_delay > -DELAY_BAD or relation.axes_correlation < FIRMLY:
         return None
     time = set_points.time
     moved = set_points._replace(time=time + _RESPONSE)
@@ -787,7 +787,7 @@ def _check_early_release(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> I
         return
     since = stamps[max(commanded[0] - 1, 0)]  # the command came after this sample
     early = since - time[taut[-1] + 1]
-    if early < _DELAY_BAD:
+    if early < DELAY_BAD:
         return
     text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "
     text += "the commands' clock is late, or it fell off"
@@ -826,7 +826,7 @@ def _report_payload_delay(place: Samples, payload: Samples, channels: str) -> It
         f"the payload is {1e3 * delay:+.0f} ms behind the vehicle: the cable's length then"
         f" varies by {1e3 * least:.1f} mm, not {1e3 * plain:.1f} ({nats:.0f} nats)"
     )
-    verdict = "bad" if abs(delay) > _DELAY_BAD else "warn"
+    verdict = "bad" if abs(delay) > DELAY_BAD else "warn"
     yield Row("delay", channels, verdict, text, {"delay_s": delay, "nats": nats})
 
 

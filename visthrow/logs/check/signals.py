@@ -119,6 +119,9 @@ def look(name: str, channel: Channel, notes: dict) -> Iterator[Row]:
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:
         text = f"{count} settled values over {span:.0f} s"
         yield Row("clock", name, "ok", text, figures)
+    elif notes.get("held") and not _speaks_of(name, _NEVER_STUCK):
+        text = f"{count} values over {span:.1f} s, each held until it changes"
+        yield Row("clock", name, "ok", text, figures)
     elif count < FEW_SAMPLES or span < SHORT:
         text = (
             f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
