@@ -491,14 +491,16 @@ def fly_by_motors(columns: dict[str, np.ndarray], motors: np.ndarray, name: str)
 
 @pytest.mark.parametrize(
     ("name", "counts", "tau"),
-    [("rpm", lambda share: 9000.0 * np.sqrt(share), 0.0), ("pwm", None, 0.03)],
+    [
+        ("rpm", lambda share: 9000.0 * np.sqrt(share), 0.0),
+        ("pwm", lambda share: 1000.0 + 900.0 * share, 0.03),
+    ],
 )
 def test_a_proposed_map_of_motors_carries_the_vehicle(name, counts, tau):
     """By the speeds of the rotors, which have no lag; by pulses, which begin at 1000 us."""
     columns = flight(20.0)
     true = columns["command"][:, 0]
-    share = true / np.max(true)
-    motors = counts(share) if counts is not None else 1000.0 + 900.0 * share
+    motors = counts(true / np.max(true))
     table = fly_by_motors(columns, motors, name)
     proposal = propose(table, "a.csv", mass=0.2)
     (log,) = logs_of(table, proposal.mapping, "a.csv")
