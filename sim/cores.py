@@ -1,5 +1,5 @@
-"""CPU cores, and kernels spread over them: a launch runs on one thread, and leaves the interpreter
-free meanwhile.
+"""Parallel launches of kernels on CPU cores. A launch uses one thread and releases the interpreter
+lock.
 """
 
 import os
@@ -9,21 +9,21 @@ from functools import cache
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def launch_in_pieces(
     launch: Callable[[int, int], None], marks: Sequence[int], threads: int
 ) -> None:
-    """Call ``launch(first, last)`` for each stretch between two marks, so many at a time, this
-    thread's among them; wait for all.
+    """Call ``launch(first, last)`` for the rows between each pair of neighbouring marks, on several
+    threads including this one, and wait for all.
 
     Args:
-        launch: of rows that depend on no others; together they leave the bits that one call for all
-            would.
+        launch: processes rows independently of each other, so that the result is bitwise equal to
+            that of a single call.
         marks: ascending, from 0 to the number of rows.
-        threads: at most.
+        threads: largest number of threads.
     """
     stretches = iter(list(zip(marks[:-1], marks[1:])))
 
@@ -41,9 +41,7 @@ def launch_in_pieces(
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that launch pieces beside the caller's; kept, since there are thousands
-    of launches.
-    """
+    """Return the pool of helper threads, which is reused for all launches."""
     return ThreadPoolExecutor(threads, "launch")
 
 

@@ -1,13 +1,13 @@
-"""The factors of laws outside the catalogue, and the quantities that they are made of, which the
-kernels and the diagnosis make alike.
+"""Factors of laws outside the catalogue, and the definitions of their quantities, which kernels and
+diagnosis share.
 """
 
 import tomllib
 from pathlib import Path
 
 LAW_FACTORS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-"""``groups`` of quantities; ``scalars`` and, by block, ``vectors``: name -> symbol, unit, quantity
-and what it is made of.
+"""``groups`` of quantities; ``scalars`` and, for each block, ``vectors``: name -> symbol, unit,
+quantity and the measured or simulated quantities that it is computed from.
 """
 
 UNITS = {
@@ -16,7 +16,7 @@ UNITS = {
     "unit_z": (0.0, 0.0, 1.0),
     "unit_down": (0.0, 0.0, -1.0),
 }
-"""Unit vectors of a frame: the world's for forces, the body's for torques."""
+"""Unit vectors, in the world frame for forces and in the body frame for torques."""
 
 QUANTITIES = {
     "axis_x": ("to_world", "quat_wb", "unit_x"),
@@ -53,16 +53,16 @@ QUANTITIES = {
     "neighbour": ("scaled", "inverse_distance", "apart"),
     "distance_upright": ("inner", "neighbour", "unit_z"),
 }
-"""Quantities that follow from measured or simulated ones: name -> operation, and what it takes.
+"""Quantities computed from measured or simulated ones: name -> operation and its arguments.
 
-Each simulator has the operations: ``sim/kernels/laws.py`` and ``diagnose/models/law_terms.py``."""
+``sim/kernels/laws.py`` and ``diagnose/models/law_terms.py`` implement the operations."""
 
 
 def definition(name: str) -> tuple[str, ...]:
-    """Return the operation that makes a quantity, and what it takes.
+    """Return the operation that computes a quantity, and its arguments.
 
-    ``name``: of :data:`QUANTITIES`, ``|a|`` for a size, or ``a x b`` for a cross product. Raises
-    KeyError: none of them.
+    ``name``: of :data:`QUANTITIES`, ``|a|`` for a norm, or ``a x b`` for a cross product. Raises
+    KeyError: an unknown quantity.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]

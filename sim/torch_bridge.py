@@ -1,6 +1,4 @@
-"""The one bridge between the simulator's Warp arrays and torch tensors: views of the same memory,
-no copies.
-"""
+"""Torch views of the simulator's Warp arrays, without copies, and capture of CUDA graphs."""
 
 import gc
 from collections.abc import Callable
@@ -18,8 +16,7 @@ class TorchViews:
 
     Attributes:
         command: shape (E, 4), writable. release: shape (E,), int32, writable. goal_w: shape (E, 3).
-        state, out, foreseen: dictionaries of the state and output arrays: (E, 3), (E,), (L, E, 3),
-            ...
+        state, out, foreseen: name -> state or output array, of shape (E, 3), (E,), (L, E, 3), ...
     """
 
     def __init__(self, sim: HybridSim):
@@ -40,12 +37,12 @@ class TorchViews:
 
 
 def on_torch_stream(device: str):
-    """Context in which Warp launches on torch's current stream, so that both can be captured in one
-    CUDA graph.
+    """Return a context in which Warp launches on torch's current stream, so that both can be
+    captured in one CUDA graph.
     """
     if not device.startswith("cuda"):
         return wp.ScopedDevice(device)
-    # a capture may not wait for another stream
+    # during a capture it must not wait for another stream
     capturing = torch.cuda.is_current_stream_capturing()
     return wp.ScopedStream(
         wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing
@@ -53,9 +50,10 @@ def on_torch_stream(device: str):
 
 
 def capture_graph(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
-    """Return a CUDA graph of what ``work`` launches; ``options`` of `torch.cuda.graph`.
+    """Capture the launches of ``work`` in a CUDA graph; ``options``: of `torch.cuda.graph`.
 
-    Python collects no garbage meanwhile: an array or graph of Warp that it frees ends the capture.
+    Garbage collection is disabled meanwhile, because freeing a Warp array or graph would abort the
+    capture.
     """
     torch.cuda.synchronize()
     graph = torch.cuda.CUDAGraph()
@@ -72,8 +70,8 @@ def capture_graph(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGr
 
 
 class ReplayedGraph:
-    """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and
-    replayed, on a separate stream.
+    """Work on fixed GPU tensors. The first call executes it, the second captures it in a CUDA
+    graph, which all later calls replay, on a separate stream.
     """
 
     def __init__(self, work: Callable[[], None]):
@@ -83,10 +81,10 @@ class ReplayedGraph:
         self._stream = torch.cuda.Stream()
 
     def __call__(self) -> None:
-        """Do the work."""
+        """Execute or replay the work."""
         self._stream.wait_stream(torch.cuda.current_stream())
         if self._graph is None and self._warm:
-            # autograd and NCCL's watchdog use the device from other threads meanwhile
+            # autograd and NCCL's watchdog may use the device from other threads during the capture
             self._graph = capture_graph(
                 self._work, stream=self._stream, capture_error_mode="thread_local"
             )

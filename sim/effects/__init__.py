@@ -1,4 +1,4 @@
 """Effects that extend the simulator beyond the paper's blocks.
 
-Their catalogue is data: `configs/effects`, fields in `effect.py`.
+`configs/effects` is the catalogue; `effect.py` is its schema.
 """

@@ -1,6 +1,4 @@
-"""Named functions of a setting that the tables of ``configs/effects`` refer to: which blocks it
-has, and it with another block.
-"""
+"""Named conditions on a setting's blocks, and changes of their kinds, for ``configs/effects``."""
 
 import math
 from collections.abc import Callable
@@ -9,16 +7,16 @@ from typing import Any
 from sim.effects.setting import AERODYNAMICS, Setting
 from sim.params import GRAVITY, change_values
 
-SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
+SEGMENTS = 15  # segments of a flexible rope (the paper, Sec. III-B)
 # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
 RELAX = 1.0 / (2.0 * math.pi * 15.0)
-# length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves
-# something
+# shortest rope to which the effect of the payload's offset applies [m]: the offset, at most 0.1 m,
+# is subtracted from its length
 LONGEST_OFFSET = 0.12
 
 
 def _replace_in_vehicle(setting: Setting, values: dict[str, Any]) -> Setting:
-    """Return a setting with other values of its vehicle."""
+    """Return a setting with new values of its vehicle; ``values``: path in the vehicle -> value."""
     return change_values(
         setting, {f"plant.vehicle.{path}": value for path, value in values.items()}
     )
@@ -32,7 +30,7 @@ def _lagging(setting: Setting) -> Setting:
 
 
 def _kind(block: str, *kinds: str) -> Callable[[Setting], bool]:
-    """Return whether a block of a setting's vehicle is of one of these kinds."""
+    """Return the condition that a block of a setting's vehicle is of one of the given kinds."""
     return lambda setting: getattr(setting.plant.vehicle, block).kind in kinds
 
 
@@ -40,8 +38,8 @@ PID = _kind("controller", "betaflight", "motor_mixing")
 
 
 def _motor_mixing(setting: Setting) -> Setting:
-    """Relax the integral with the same gains in hover: iterm_relax of 15 Hz in place of the
-    set-point's filter, the feed-forward off.
+    """Return the setting with the controller ``motor_mixing``: the same gains in hover, iterm_relax
+    of 15 Hz instead of the set-point filter, and no feed-forward.
     """
     plant = setting.plant
     controller = {
@@ -79,7 +77,7 @@ CONDITIONS: dict[str, Callable[[Setting], bool]] = {
     "rigid rope": lambda s: s.plant.rope.segments == 1,
     "camera": lambda s: s.camera is not None,
 }
-"""Name -> whether a setting has what an effect changes."""
+"""Name -> condition that a setting must meet for an effect to apply."""
 
 SWITCHES: dict[str, Callable[[Setting], Setting]] = {
     "PID controller": lambda s: _replace_in_vehicle(s, {"controller.kind": "betaflight"}),
@@ -90,4 +88,4 @@ SWITCHES: dict[str, Callable[[Setting], Setting]] = {
     "flexible rope": lambda s: change_values(s, {"plant.rope.segments": SEGMENTS}),
     "rigid rope": lambda s: change_values(s, {"plant.rope.segments": 1}),
 }
-"""Name -> the setting with another kind of block."""
+"""Name -> function that replaces a block of a setting by another kind."""

@@ -1,9 +1,8 @@
-"""Effects: what reality may have and the simulator lacks, and what each changes in the description
-of a simulated flight.
+"""Effects: possible differences between reality and the simulator, as changes of a setting.
 
-The equation of an effect stands in the block of :mod:`sim` that it extends (or in
-:mod:`sim.kernels.replay.sampling`); its table in ``configs/effects`` names the numbers of a
-:class:`sim.effects.setting.Setting` that it changes, nothing more."""
+An effect's equation is implemented in the block of :mod:`sim` that it extends, or in
+:mod:`sim.kernels.replay.sampling`. Its table in ``configs/effects`` only lists the numbers of a
+:class:`sim.effects.setting.Setting` that it changes."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -19,28 +18,28 @@ from sim.params import change_values
 
 @dataclass(frozen=True)
 class Effect(BoundedFields):
-    """One cause that reality may have and the model lacks, or has with another size.
+    """A way in which reality may differ from the model.
 
-    The size theta is a *deviation*: 0 means that the model is right as it stands.
+    The size theta is a *deviation* from the model: 0 means that the model is correct.
     """
 
     name: str  # identifier, such as rope_length
     cause: str  # in words, as the first half of a sentence
-    equation: str  # what it changes, with theta
+    equation: str  # the change of the model, with theta
     unit: str  # of theta
     block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
     bounds: tuple[float, float]  # physically possible values of theta
-    prior_sd: Positive  # spread of theta where the effect is present
-    # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise;
-    # the diagnosis of throws says by how much a size moves landings
+    prior_sd: Positive  # standard deviation of theta if the effect is present
+    # negligible size: numerical error, and 5 mm of landing or a tenth of the noise; the diagnosis
+    # of throws computes how far a size moves landings
     floor: Positive
-    channels: tuple[str, ...]  # channels of the log that it needs
+    channels: tuple[str, ...]  # channels of the log that are required to estimate it
     source: str  # of equation and prior
     manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from similar effects
-    # group of effects that differ from each other by less than their equations are exact
+    # group of effects whose differences are smaller than the errors of their equations
     alike: str = ""
-    # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says
-    # little
+    # another kind of block, which replaces the present one if theta is 1 (not 0); derivatives with
+    # respect to such a theta are of little use
     switch: str = ""
 
 
@@ -49,8 +48,8 @@ class Change(BoundedFields):
     """A number of a setting that an effect changes."""
 
     path: str  # such as plant.vehicle.thrust.gain
-    index: int | None = None  # of a tuple; None: all of it
-    scale: bool = False  # times (1 + factor theta) instead of plus factor theta
+    index: int | None = None  # element of a tuple; None: all elements
+    scale: bool = False  # multiply by (1 + factor theta) instead of adding factor theta
     factor: float = 1.0  # of theta
 
     def __post_init__(self) -> None:
@@ -72,8 +71,8 @@ class Change(BoundedFields):
 
 
 def _check_path(path: str) -> None:
-    """Raise ValueError for a number that no setting has; those of the camera, which the simulator
-    knows nothing of, pass.
+    """Raise ValueError if a setting has no number at this path. Paths in the camera are not
+    checked, because the simulator does not define them.
     """
     owner: Any = Setting
     for name in path.split("."):
@@ -105,15 +104,15 @@ def _read(setting: Any, path: str) -> Any:
 
 @dataclass(frozen=True)
 class Lowest(BoundedFields):
-    """A lower bound of theta, such that a number of the setting, which theta changes, keeps a part.
+    """A lower bound of theta that limits the decrease of a number of the setting.
 
-    At the bound, ``(1 - share) * number + factor * least`` remains of the number.
+    At the bound, the number is ``(1 - share) * number + factor * least``.
     """
 
     path: str  # of the number
-    share: float = 1.0  # part of the number that theta may take away
+    share: float = 1.0  # share of the number by which theta may reduce it
     factor: float = 1.0  # change of the number for each unit of theta
-    least: float = 0.0  # size of theta whose change of the number remains besides [unit of theta]
+    least: float = 0.0  # added to the bound [unit of theta]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -122,19 +121,18 @@ class Lowest(BoundedFields):
 
 @dataclass(frozen=True)
 class SettingEffect(Effect):
-    """An effect as a change of a setting; a table of ``configs/effects``.
+    """An effect that changes a setting; a table of ``configs/effects``.
 
-    Raises ValueError: a condition or a kind of block that does not exist, or neither or both of
-    changes and switch."""
+    Raises ValueError: an unknown condition or switch, or neither or both of changes and switch."""
 
     changes: tuple[Change, ...] = ()
     step: Positive = 0.25  # of theta for derivatives, in floors
-    needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
-    # a switch to a simpler block: only on request, as each compiles a kernel
+    needs: str = "always"  # condition on the setting, a name of sim.effects.blocks.CONDITIONS
+    # whether it switches to a simpler block: only on request, because it compiles another kernel
     simpler: bool = False
-    # whether it is a state of these flights only, which no configuration of the vehicle takes over
+    # whether it is specific to the recorded flights and not written to the vehicle's configuration
     transient: bool = False
-    lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
+    lowest: tuple[Lowest, ...] = ()  # additional bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -148,7 +146,7 @@ class SettingEffect(Effect):
             raise ValueError("got both changes and a switch, or neither; expected one of them")
 
     def applies(self, setting: Setting) -> bool:
-        """Tell whether a setting has what the effect changes."""
+        """Return whether a setting has the blocks and numbers that the effect changes."""
         return CONDITIONS[self.needs](setting)
 
     def apply(self, setting: Setting, theta: float) -> Setting:
@@ -160,7 +158,7 @@ class SettingEffect(Effect):
         return setting
 
     def bound_by(self, setting: Setting) -> "SettingEffect":
-        """Return the effect with the lower bound that this setting's own numbers set."""
+        """Return the effect with its lower bound raised to the limits of this setting's numbers."""
         if not self.lowest:
             return self
         low, high = self.bounds
@@ -171,15 +169,15 @@ class SettingEffect(Effect):
 
 @dataclass(frozen=True)
 class RandomEffect(BoundedFields):
-    """A quantity that is drawn anew in every flight, from a normal distribution about its mean."""
+    """A quantity that varies between flights with a normal distribution about its mean."""
 
     name: str
     cause: str  # in words, as the first half of a sentence
-    equation: str  # theta: the standard deviation
-    of: tuple[str, ...]  # effects, in whose unit it is; of several one deviation for all
+    equation: str  # with theta, the standard deviation
+    of: tuple[str, ...]  # effects that vary, all with the same standard deviation
     unit: str
     block: str
-    prior_sd: Positive  # of the half-normal deviation, where the quantity varies
+    prior_sd: Positive  # of the half-normal prior of theta if the quantity varies
     floor: Positive
     source: str
     manoeuvres: tuple[str, ...] = ()
@@ -187,7 +185,7 @@ class RandomEffect(BoundedFields):
 
 @dataclass(frozen=True)
 class EffectTables:
-    """A file of ``configs/effects``: name -> what bears it."""
+    """Schema of a file of ``configs/effects``: name -> effect."""
 
     effects: dict[str, SettingEffect] = field(default_factory=dict)
     random_effects: dict[str, RandomEffect] = field(default_factory=dict)
@@ -196,9 +194,9 @@ class EffectTables:
 def apply(
     effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]
 ) -> Setting:
-    """Return the setting with effects of these sizes, applied in the order of ``effects``.
+    """Apply effects of the sizes ``theta`` to a setting, in the order of ``effects``.
 
-    Raises KeyError: no effect of that name."""
+    Raises KeyError: an unknown effect."""
     if unknown := theta.keys() - effects.keys():
         raise KeyError(*unknown)
     for name, effect in effects.items():
@@ -210,11 +208,11 @@ def apply(
 def possible_together(
     effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the sizes that can be applied together: none takes more of a number than the effects
-    before it leave.
+    """Raise sizes to the lower bounds that remain after the effects before them are applied.
 
-    Bounds hold for an effect alone. Two that lower one number, each within its bounds, could make
-    it negative. ``theta``: sizes within the bounds, of effects that :func:`apply` is to apply.
+    The bounds of an effect assume that it acts alone. Two effects within their bounds that reduce
+    the same number could together make it negative. ``theta``: sizes within the bounds, to be
+    applied by :func:`apply`. Returns the sizes that differ from 0.
     """
     sizes = {}
     for name, effect in effects.items():

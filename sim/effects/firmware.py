@@ -1,5 +1,5 @@
-"""The rate controller of Betaflight's firmware as a block of ours, from its settings as its
-blackbox names them.
+"""Conversion of Betaflight's settings, as its blackbox logs them, to the rate controller
+``motor_mixing``.
 
 Source: betaflight 4.6, src/main/flight/pid.h (PTERM_SCALE, ITERM_SCALE, DTERM_SCALE,
 FEEDFORWARD_SCALE, PID_MIXER_SCALING), pid.c (applyItermRelax), pid_init.c, mixer.c
@@ -16,11 +16,11 @@ I_SCALE = 0.244381
 D_SCALE = 0.000529
 F_SCALE = 0.013754
 MIXER_SCALE = 1000.0
-"""Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output
-that is all of a motor's command.
+"""Output of a setting of 1 for an error of 1 deg/s (P), 1 deg (I), 1 deg/s^2 (D) and a feed-forward
+of 1 deg/s^2; output that equals a motor's full command.
 """
 
-YAW_I = 2.5  # times the setting, about yaw (pid_init.c, pidInitConfig)
+YAW_I = 2.5  # factor on the I setting about yaw (pid_init.c, pidInitConfig)
 
 DEGREE = math.degrees(1.0)
 
@@ -39,11 +39,11 @@ NOT_SAID = {
         "smooths P of yaw: of the gyro's part the block has the lag, of the command's none"
     ),
 }
-"""Settings that the block has no number for, and what they do where they are not 0."""
+"""Setting that the block does not model -> its effect if it is not 0."""
 
 
 def numbers(settings: Mapping[str, str], name: str, default: str = "0") -> list[float]:
-    """Numbers of a setting, such as ``rollPID:11,20,8``."""
+    """Return the numbers of a setting, such as ``rollPID:11,20,8``."""
     return [float(word) for word in settings.get(name, default).split(",")]
 
 
@@ -64,8 +64,8 @@ def missing_features(settings: Mapping[str, str]) -> list[str]:
 def calibrated_voltage(
     vehicle: VehicleParams, settings: Mapping[str, str], weight: float, hover: float
 ) -> float:
-    """Voltage [V] at which a share of throttle, 0 to 1, makes a motor carry a weight [N], by the
-    vehicle's own thrust.
+    """Return the voltage [V] at which a motor's thrust at the throttle ``hover``, 0 to 1, equals
+    ``weight`` [N], according to the vehicle's thrust map.
     """
     idle = numbers(settings, "motor_idle")[0] * 1e-4
     full = weight / (idle + (1.0 - idle) * hover) ** 2
@@ -82,19 +82,19 @@ NEEDED = (
     "pidsum_limit",
     "iterm_windup",
 )
-"""Settings without which there is no controller; other filters count as off."""
+"""Required settings. Filters that are not among the settings count as off."""
 
 
 def _lag(settings: Mapping[str, str], *names: str) -> float:
-    """Return the delay of low-passes one after the other [s]; 0 Hz are none."""
+    """Return the delay of low-passes in series [s]; 0 Hz means off."""
     cutoffs = [numbers(settings, name)[0] for name in names]
     return sum(1.0 / (2.0 * math.pi * hz) for hz in cutoffs if hz > 0.0)
 
 
 def _torques(vehicle: VehicleParams, thrust: float) -> list[float]:
-    """Return the torques about the axes for an output of 1 a degree [N m].
+    """Return the torques about the axes for an output of 1 per degree [N m].
 
-    ``thrust``: of a motor for a mixer output of 1 [N].
+    ``thrust``: of a motor for its full command, by linearisation [N].
     """
     rotors = vehicle.rotors
     arms = (sum(map(abs, rotors.y)), sum(map(abs, rotors.x)), 4.0 * vehicle.thrust.torque_ratio)
@@ -104,7 +104,7 @@ def _torques(vehicle: VehicleParams, thrust: float) -> list[float]:
 def _gains(
     torques: list[float], scale: float, values: Sequence[float]
 ) -> tuple[float, float, float]:
-    """Return the gains of the axes, or their limits [N m]."""
+    """Return the gains, or limits [N m], of the three axes."""
     x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
     return x, y, z
 
@@ -112,11 +112,11 @@ def _gains(
 def controller_of(
     vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float
 ) -> ControllerParams:
-    """Numbers of the block ``motor_mixing``. Raises ValueError: a setting is missing.
+    """Compute the parameters of ``motor_mixing``. Raises ValueError: a setting is missing.
 
     Args:
-        vehicle: whose rotors the firmware drives; its ``max_thrust`` is at the battery's reference
-            voltage.
+        vehicle: with the rotors that the firmware drives; its ``max_thrust`` applies at the
+            battery's reference voltage.
         settings: by their names in the blackbox's header: rollPID, pitchPID, yawPID, ff_weight,
             iterm_relax_cutoff, motor_idle, gyro_lpf1_static_hz, gyro_lpf2_static_hz,
             dterm_lpf1_static_hz, dterm_lpf2_static_hz, yaw_lowpass_hz, pidsum_limit, iterm_windup.
@@ -132,7 +132,7 @@ def controller_of(
     c = vehicle.controller
     full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
     idle = numbers(settings, "motor_idle")[0] * 1e-4
-    thrust = 2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)  # for an output of 1 [N]
+    thrust = 2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)  # slope over the command [N]
     torques = _torques(vehicle, thrust)
     p, i, d, *_ = zip(*[numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")])
     forward = numbers(settings, "ff_weight")

@@ -1,6 +1,4 @@
-"""What a simulated flight is described by, and the description in which every effect is a change of
-numbers.
-"""
+"""Setting of a simulated flight, and its generalisation, in which effects change only numbers."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -18,27 +16,26 @@ AERODYNAMICS = (
     "translational_lift",
     "flapping",
 )
-"""Coefficients of the vehicle's aerodynamics; all zero is a vehicle that feels no air."""
+"""Coefficients of the vehicle's aerodynamics; all are zero for a vehicle without air forces."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The setting of a replay: the plant that training reads too, the sensors, and the step."""
+    """Setting of a replay: the plant, the sensors' errors, and the step."""
 
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)
-    # of the integration step relative to the requested one: errors grow with it
+    # square of the ratio of integration step to requested step, to which errors are proportional
     step_square: float = 1.0
-    # camera.params.CameraParams whose keypoints the logs hold, which the simulator knows nothing
-    # of; or None
+    # camera.params.CameraParams of the keypoints in the logs, not used by the simulator; or None
     camera: Any = None
 
 
 def generalise(setting: Setting) -> Setting:
-    """Return the same plant in the kinds of block that have most numbers.
+    """Return the same plant with the most general kinds of blocks.
 
-    A plant without aerodynamics becomes one with zero coefficients, a first-order motor one of two
-    equal lags."""
+    Missing aerodynamics become zero coefficients; a first-order motor becomes one with two equal
+    time constants."""
     vehicle = setting.plant.vehicle
     values: dict[str, Any] = {}
     if vehicle.aero.kind == "none":
@@ -53,8 +50,8 @@ def generalise(setting: Setting) -> Setting:
 
 
 def specialise(plant: PlantParams, before: PlantParams) -> PlantParams:
-    """Return the plant with the kinds that it had before it was generalised, wherever they still
-    say the same.
+    """Return the plant with the kinds of blocks that it had before it was generalised, wherever
+    they are still equivalent.
     """
     motor = plant.vehicle.motor
     aero = plant.vehicle.aero

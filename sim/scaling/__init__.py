@@ -1,1 +1,1 @@
-"""The plant in other units, and vehicles of one class drawn at any size."""
+"""Conversion of a plant to other units, and random vehicles of one class at any size."""

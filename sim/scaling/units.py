@@ -1,8 +1,8 @@
-"""Other units of length, mass and time for the same plant: what makes vehicles of any size
-comparable.
+"""Conversion of a plant to other units of length, mass and time, to compare vehicles of any size.
 
-With a unit of time that is the square root of the unit of length, gravity keeps its number, so that
-a plant in other units is flown by the same equations with the same gravity. Volts stay volts."""
+The unit of time is the square root of the unit of length. Gravity then keeps its numerical value,
+so that a plant in other units has the same equations with the same gravity. Volts are not
+converted."""
 
 import dataclasses
 import math
@@ -35,12 +35,12 @@ def dimensions_of(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str
 
 
 PLANT = dimensions_of(_FILE)
-"""Dimensions of a plant's fields by its tables."""
+"""Class of a plant's parameters -> field -> dimension."""
 
 
 @dataclass(frozen=True)
 class Units:
-    """Units of length [m] and mass [kg]; that of time [s] follows from gravity."""
+    """Units of length [m] and mass [kg]; the unit of time [s] follows from gravity."""
 
     length: float
     mass: float
@@ -51,23 +51,23 @@ class Units:
         return math.sqrt(self.length)
 
     def size(self, dimension: Dimension) -> float:
-        """Size of the unit of a dimension in SI units."""
+        """Return the unit of a dimension in SI units."""
         length, mass, time = dimension
         return self.length**length * self.mass**mass * self.time**time
 
     @property
     def inverse(self) -> "Units":
-        """Units that lead back."""
+        """Units of the inverse conversion."""
         return Units(1.0 / self.length, 1.0 / self.mass)
 
 
 def convert_units(
     value: Value, units: Units, dimensions: Mapping[str, Mapping[str, Dimension]] = PLANT
 ) -> Value:
-    """Dataclass of SI values with its numbers stated in other units, tables in it too.
+    """Convert a dataclass of SI values, and the dataclasses in it, to other units.
 
-    Raises ValueError: a field without a dimension, or a plant with laws, whose coefficients
-    have none of their own."""
+    Raises ValueError: a field without a known dimension, or a plant with laws, whose coefficients
+    have various dimensions."""
     if isinstance(value, PlantParams) and value.laws:
         raise ValueError(
             f"{len(value.laws)} laws of a plant to state in other units; expected none: the"

@@ -1,11 +1,9 @@
-"""A class of vehicles: one that is known, made larger or smaller as real ones are, and changed at
-random about that.
+"""A class of vehicles: a known vehicle scaled to another size, with random deviations.
 
-Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the
-cube root of the mass, thrust as the mass, inertia as mass times arm squared, and times as the
-square root of the arm: this is :class:`sim.scaling.units.Units` applied to the known vehicle. Every
-factor multiplies what that gives. What does not follow size, links and sensors, stays in
-seconds."""
+For vehicles of equal shape, density and Froude number, the arm is proportional to the cube root of
+the mass, thrust to the mass, inertia to mass times arm squared, and times to the square root of the
+arm. The known vehicle is scaled in this way by :class:`sim.scaling.units.Units`, then multiplied by
+random factors. The delays of links and sensors do not depend on size and stay in seconds."""
 
 import math
 import tomllib
@@ -26,34 +24,35 @@ Range = tuple[float, float]
 SCALES: dict[str, dict[str, str]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
 )
-"""Table -> path of a number -> factors that it is multiplied by."""
+"""Table -> path of a number -> its factors."""
 
 
 @dataclass(frozen=True)
 class FleetParams(BoundedFields):
-    """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to
-    the known vehicle made to size.
+    """Ranges of the log-uniform distributions of vehicle, rope and release. Factors are relative to
+    the known vehicle after scaling.
 
-    The task and the numerics of an experiment with a fleet are stated in units of ``rope_length``
-    and ``total_mass``: what is 0.33 m there is a rope's length for each."""
+    The task and the numerics of an experiment with a fleet are in units of ``rope_length`` and
+    ``total_mass``: for each vehicle, ``rope_length`` metres there equal its rope's length."""
 
-    count: int  # vehicles drawn; 0: the experiment's own, which is stated in SI units
-    first: int  # number of the first one: vehicle k is the same in every draw
+    count: int  # number of vehicles; 0: only the experiment's vehicle, in SI units
+    first: int  # number of the first vehicle; vehicle k is the same in every draw
     seed: int
     rope_length: Positive  # [m]
-    total_mass: Positive  # vehicle and all that hangs on it [kg]
-    # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
+    total_mass: Positive  # of vehicle, rope and payload [kg]
+    # smallest ratio of full thrust to total weight, which limits the payload's mass [-]
     least_thrust: Positive
     mass: Range  # of the vehicle [kg]
     thrust: Range  # factor of the full thrust
     arm: Range  # factor
-    inertia: Range  # factor, besides the arm squared
-    yaw_inertia: Range  # factor of the inertia about z, besides the last one
+    inertia: Range  # factor, in addition to the arm squared
+    yaw_inertia: Range  # factor of the inertia about z, in addition to inertia
     motor_lag: Range  # factor
-    propeller: Range  # factor of the radius
-    torque_ratio: Range  # factor, besides the propeller's
-    rotor_inertia: Range  # factor, besides the propeller's radius squared
-    p_gain: Range  # factor; the gains follow the inertia, p_gain the motor's lag too
+    propeller: Range  # factor of the radius, in addition to the arm
+    torque_ratio: Range  # factor, in addition to those of the radius
+    rotor_inertia: Range  # factor, in addition to the radius squared
+    # factor; all gains are proportional to the inertia, p_gain inversely to the motor's lag
+    p_gain: Range
     i_gain: Range  # factor
     d_gain: Range  # factor
     feedforward: Range  # factor
@@ -63,19 +62,18 @@ class FleetParams(BoundedFields):
     compensation: Range  # of the voltage [-]
     drag: Range  # factor of all aerodynamic coefficients
     rope: Range  # factor of the length
-    payload: Range  # factor of the mass, at most what least_thrust leaves
+    payload: Range  # factor of the mass, limited by least_thrust
     payload_size: Range  # factor of the radius
-    rope_mass: Range  # factor of the mass for a length
+    rope_mass: Range  # factor of the mass per length
     mount: Range  # factor of the mount's distance from the centre of mass
     lag: Range  # of the release [s]
     yaw_loop: Positive | None = (
-        # with it, yaw gains are turned down until :func:`yaw_rate` is this times the known
-        # vehicle's at most
+        # largest ratio of :func:`yaw_rate` to the known vehicle's, to which yaw gains are reduced
         None
     )
 
     def __post_init__(self) -> None:
-        """Raise ValueError for ranges that nothing can be drawn from."""
+        """Raise ValueError for invalid ranges."""
         super().__post_init__()
         if self.count < 0 or self.first < 0 or self.seed < 0:
             raise ValueError(
@@ -90,23 +88,23 @@ class FleetParams(BoundedFields):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Ranges by name, in their order."""
+        """Name -> range, in the order of the fields."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.type == Range}
 
     def units_of(self, plant: PlantParams) -> Units:
-        """Units in which a plant's rope and total mass have this class's numbers."""
+        """Return the units in which a plant's rope length and total mass are this class's."""
         return Units(plant.rope.length / self.rope_length, plant.total_mass / self.total_mass)
 
 
 def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
-    """Vehicle of that number with its rope and release, SI units; numerics and air are those of the
-    known plant.
+    """Draw the vehicle of a number with its rope and release, in SI units. Numerics and air are the
+    known plant's.
     """
     low, high = np.log(list(fleet.ranges.values())).T
     factors = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
     x = dict(zip(fleet.ranges, factors.tolist()))
     ratio = nominal.vehicle.body.mass / x["mass"]
-    # in these units the known vehicle has the mass that was drawn
+    # scales the known vehicle to the mass that was drawn
     alike = Units(ratio ** (1 / 3), ratio)
     usual = convert_units(nominal.vehicle, alike)
     rope = convert_units(nominal.rope, alike)
@@ -125,11 +123,11 @@ def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
 
 
 def yaw_rate(v: VehicleParams) -> float:
-    """Bandwidth of the yaw loop by its rotors' inertia alone [1/s], in hover.
+    """Return the bandwidth of the yaw loop due to the rotors' inertia alone [1/s], in hover.
 
-    A rotor that is made to turn faster pushes the body at once, by ``J_r`` over the motor's lag: on
-    many vehicles more than by its drag. Where that is faster than a flight controller's clock, yaw
-    swings up."""
+    The acceleration of a rotor causes an immediate reaction torque on the body, proportional to
+    ``J_r`` over the motor's lag. On many vehicles it exceeds the change of drag torque. If this
+    bandwidth exceeds the flight controller's update rate, yaw becomes unstable."""
     speed = math.sqrt(v.body.mass * GRAVITY / (4.0 * v.thrust.k_f))
     push = v.rotors.inertia / (
         2.0 * v.thrust.k_f * speed * v.motor.time_constant * v.thrust.torque_ratio
@@ -138,7 +136,7 @@ def yaw_rate(v: VehicleParams) -> float:
 
 
 def _calm(v: VehicleParams, share: float) -> VehicleParams:
-    """Return the vehicle with its yaw gains turned down to a share of them, if that is below 1."""
+    """Return the vehicle with its yaw gains multiplied by ``share``, if that is below 1."""
     c = v.controller
     share = min(share, 1.0)
     names = ("p_gain", "i_gain", "feedforward_gain")
@@ -156,7 +154,9 @@ def _product(factors: str, x: Mapping[str, float]) -> float:
 
 
 def _multiply(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any]:
-    """Return the numbers of a dataclass that a table of :data:`SCALES` names, times its factors."""
+    """Return path -> value for the numbers in a table of :data:`SCALES`, multiplied by its
+    factors.
+    """
     values: dict[str, Any] = {}
     for path, factors in SCALES[table].items():
         value = attrgetter(path)(owner)
@@ -167,7 +167,7 @@ def _multiply(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any]:
 
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
-    """Return a vehicle with the factors drawn."""
+    """Return the vehicle multiplied by the factors that were drawn."""
     values = _multiply(v, "vehicle", x)
     for path, factors in SCALES["yaw"].items():
         *level, about_z = values[path]
