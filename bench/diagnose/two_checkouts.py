@@ -47,7 +47,7 @@ except ImportError:  # of an older checkout
     from visthrow.diagnose.select.search import explain
 vehicle, seed = sys.argv[1:]
 logs = [FlightLog.load(path) for path in sorted(Path().glob("flight_*.npz"))]
-model = MODELS["flyer"](logs, foreign.known(vehicle))
+model = MODELS["flyer"](logs, foreign.describe_vehicle(vehicle))
 answer = explain(model, seed=int(seed))
 Path("verdict.json").write_text(json.dumps(to_json(answer)))
 """
