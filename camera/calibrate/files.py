@@ -1,15 +1,15 @@
-"""Calibration files of the field, as our lens: a file's keys say which tool wrote it.
+"""Reading of other tools' calibration files. A file's keys identify the tool.
 
 Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, OKVIS,
-vikit, ORB-SLAM, stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as ``topic
-echo`` prints it), OpenCV's FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one
-or several cameras. A box says where the numbers of a camera stand; `camera.calibrate.foreign`
-knows the models.
+vikit, ORB-SLAM, stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as printed by
+``topic echo``), OpenCV's FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or
+several cameras. ``tools.toml`` describes the format of each tool; `camera.calibrate.foreign`
+implements the lens models.
 
 Convention: pixel (0, 0) is the centre of the top left pixel, x right, y down, z forward, as in
-`FisheyeParams`. None of the files holds a field of view; it is read from an extra key ``fov_deg``,
-which their own readers ignore. A file without it gets the ``fov_deg`` of the call [deg] or, that
-left out, the angle that the farthest corner of the image sees."""
+`FisheyeParams`. These formats have no field of view. It is read from an additional key ``fov_deg``,
+which the tools' own readers ignore; else it is the argument ``fov_deg`` [deg], or by default the
+angle of the image's farthest corner."""
 
 import math
 import re
@@ -35,9 +35,9 @@ from camera.params import FisheyeParams, MountParams, monotonic_limit
 Node = dict[str, Any]
 Values = dict[str, float]
 Entry = tuple[str, Node, str]
-"""A camera in a file: its box, its node and what it is called there."""
+"""A camera in a file: its tool, its node and its name in the file."""
 Camera = tuple[str, Values]
-"""Model, as `camera.calibrate.foreign.project` calls it, and its numbers."""
+"""Name of the model in `camera.calibrate.foreign.project`, and its numbers."""
 
 KB4 = "fx fy cx cy k1 k2 k3 k4"
 LABELS = {
@@ -49,7 +49,7 @@ LABELS = {
     "fov": "fov atan",
     "none": "none",
 }
-"""Distortion -> what tools call it, in small letters without signs."""
+"""Distortion -> its names in various tools, in lower case without punctuation."""
 
 
 NOT_A_ROTATION = 1e-3  # largest entry of R R^T - 1
@@ -60,18 +60,18 @@ def read(
 ) -> tuple[str, FisheyeParams, FitReport]:
     """Read a calibration file.
 
-    Raises ValueError: the file is missing, no text, of no known tool or model, or its numbers
-    describe no lens; the message names the file.
+    Raises ValueError: the file is missing, not text, of an unknown tool or model, or its numbers
+    are not a valid lens. The message names the file.
 
     Args:
         path: The file.
-        camera: Number from 0, or name, of the camera in a file that holds several.
-        fov_deg: Full field of view where the file has none [deg].
-        model: Distortion model, a key of `LABELS`, where the file names none or a wrong one.
+        camera: Index from 0, or name, of the camera in a file with several cameras.
+        fov_deg: Full field of view if the file has none [deg].
+        model: Distortion model, a key of `LABELS`, if the file's is missing or wrong.
 
     Returns:
-        The tool that writes such files, the fisheye, and what a fit of another lens model left over
-        (zero where the file holds ours).
+        The tool that writes such files, the fisheye, and the error of a fit to another lens model
+        (zero if the file uses ours).
     """
     try:
         cameras = _cameras_of(path)
@@ -94,11 +94,11 @@ def read(
 
 
 def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
-    """Return the mount of Kalibr's ``T_cam_imu`` (OpenVINS: ``T_imu_cam``), or None where a file
-    states neither.
+    """Read the mount from Kalibr's ``T_cam_imu`` (OpenVINS: ``T_imu_cam``); None if the file has
+    neither.
 
-    Convention: the IMU sits at the centre of mass, its axes are the body's (x forward, y left, z
-    up). Raises ValueError: no 4 x 4 matrix with a rotation."""
+    Convention: the IMU is at the centre of mass, and its axes are the body's (x forward, y left, z
+    up). Raises ValueError: not a 4 x 4 matrix with a rotation."""
     from scipy.spatial.transform import Rotation
 
     _, node, _ = _choose_camera(_cameras_of(path), camera)
@@ -136,11 +136,11 @@ def _choose_camera(entries: list[Entry], camera: int | str) -> Entry:
     )
 
 
-# What a file holds: a tree of mappings and lists
+# Parsing of a file to a tree of mappings and lists
 
 
 def _tree(path: str | Path) -> Any:
-    """Mappings and lists of a YAML or XML file, or of OCamCalib's text; JSON is YAML too."""
+    """Parse a YAML, JSON (as YAML) or XML file, or OCamCalib's text."""
     if not Path(path).is_file():
         raise ValueError("not a file; expected a calibration file")
     try:
@@ -156,11 +156,13 @@ def _tree(path: str | Path) -> Any:
 
 
 def _tree_of_yaml(text: str) -> Any:
-    """First document that is a mapping or a list; OpenCV's head and tags are passed over."""
+    """Parse the first document that is a mapping or a list. OpenCV's header and tags are
+    removed.
+    """
     import yaml
 
     text = re.sub(r"\A%YAML[^\n]*\n|!!opencv-matrix", "", text).replace("\t", "    ")
-    text = re.sub(r"(?m)^(\s*[\w.]+):(?=[\[\d-])", r"\1: ", text)  # OpenCV needs no blank there
+    text = re.sub(r"(?m)^(\s*[\w.]+):(?=[\[\d-])", r"\1: ", text)  # OpenCV omits this blank
     try:
         documents = list(yaml.safe_load_all(text))
     except (yaml.YAMLError, ValueError) as error:
@@ -184,7 +186,7 @@ def _tree_of_xml(text: str) -> Any:
 
 
 def _cameras_of(path: str | Path) -> list[Entry]:
-    """Cameras of a file, by their names or numbers."""
+    """Return the cameras of a file, identified by unique names or by their index."""
     cameras = list(_cameras(_tree(path)))
     names = [name for *_, name in cameras]
     named = []
@@ -195,7 +197,7 @@ def _cameras_of(path: str | Path) -> list[Entry]:
 
 
 def _cameras(tree: Any, name: str = "") -> Iterator[Entry]:
-    """Yield each camera in a tree: its box, its node and what it is called there."""
+    """Yield each camera in a tree: its tool, its node and its name."""
     if isinstance(tree, list):
         named: dict[Any, Any] = dict(enumerate(tree))
     elif isinstance(tree, dict):
@@ -211,8 +213,8 @@ def _cameras(tree: Any, name: str = "") -> Iterator[Entry]:
 
 
 def _uniform(tree: Node) -> Node:
-    """Put basalt's cameras, whose intrinsics and resolutions stand in two lists, one beside the
-    other; call ORB-SLAM's first of two cameras as its only one.
+    """Normalise a tree: combine basalt's separate lists of intrinsics and resolutions by camera,
+    and rename ORB-SLAM's ``Camera1`` to ``Camera``.
     """
     lenses = tree.get("intrinsics") if "resolution" in tree else None
     if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
@@ -223,12 +225,12 @@ def _uniform(tree: Node) -> Node:
     return {re.sub(r"^Camera1\.", "Camera.", str(key)): entry for key, entry in tree.items()}
 
 
-# Numbers in it
+# Numbers in a tree
 
 
 def _find(node: Node, names: str) -> Any:
-    """Return the value of the first key that exists, or None; a dot leads into a mapping, or with
-    a number into a list.
+    """Return the value of the first key that exists, or None. A dot separates the keys of nested
+    mappings and the indices of lists.
     """
     for name in names.split():
         value: Any = node
@@ -249,7 +251,7 @@ def _has(node: Node, names: str) -> bool:
 
 
 def _find_any(node: Node, names: str) -> Any:
-    """Return what `_find` does; ValueError where none of the keys exists."""
+    """Return the value of the first key that exists. Raises ValueError: none exists."""
     value = _find(node, names)
     if value is None:
         keys = " or ".join(map(repr, names.split()))
@@ -258,7 +260,7 @@ def _find_any(node: Node, names: str) -> Any:
 
 
 def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
-    """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
+    """Return ``count`` numbers from a list, a list of lists, or the ``data`` of a matrix."""
     flat = value.get("data", value) if isinstance(value, dict) else value
     if isinstance(flat, list) and all(isinstance(row, list) for row in flat):
         flat = list(chain.from_iterable(flat))
@@ -275,7 +277,7 @@ def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
 
 
 def _number(node: Node, place: str) -> float:
-    """Return the number at a place as `tools.toml` writes it."""
+    """Return the number at a place in the notation of `tools.toml`."""
     if place.replace(".", "").isdigit():
         return float(place)
     name = place.removesuffix("?")
@@ -286,7 +288,7 @@ def _number(node: Node, place: str) -> float:
 
 
 def _values(node: Node, numbers: list[str]) -> Values:
-    """Return the numbers of a camera by our names."""
+    """Return a camera's numbers by our names; ``numbers``: in the notation of `tools.toml`."""
     values: Values = {}
     for spec in numbers:
         places, listed, names = spec.rpartition(": ")
@@ -302,7 +304,7 @@ def _values(node: Node, numbers: list[str]) -> Values:
 
 
 def _label(node: Node, tool: Node) -> str:
-    """Distortion model by whatever name a tool gives it."""
+    """Return our name of a camera's distortion model."""
     word = str(node.get("asked_model") or _find_any(node, tool["label"]))
     plain = re.sub(r"[^a-z0-9]", "", word.lower())
     if not node.get("asked_model"):
@@ -314,7 +316,7 @@ def _label(node: Node, tool: Node) -> str:
 
 
 def _model(core: str, distortion: str, values: Values, coefficients: list[float]) -> Camera:
-    """Model of a core and its distortion; coefficients beyond those of the model must be zero."""
+    """Combine a core, its distortion and the coefficients. Surplus coefficients must be zero."""
     if core == "pinhole" and distortion == "kb4":
         core = "kb4"
         distortion = "none"
@@ -337,17 +339,17 @@ def _model(core: str, distortion: str, values: Values, coefficients: list[float]
     return (core if distortion == "none" else f"{core}-{distortion}"), values
 
 
-# Boxes: where the numbers of one camera stand
+# Formats of the tools
 
 
 BOXES: dict[str, Node] = tomllib.loads(
     Path(__file__).with_name("tools.toml").read_text(encoding="utf-8")
 )
-"""Tool -> where its numbers stand."""
+"""Tool -> format of its files."""
 
 
 def _camera(box: str, node: Node) -> Camera:
-    """Model and numbers of a camera in a tool's file."""
+    """Read the model and the numbers of a camera in a tool's file."""
     tool = BOXES[box]
     if "kind" in tool:
         word = str(_find(node, tool["kind"]) or tool.get("default", ""))
@@ -384,8 +386,8 @@ def _camera(box: str, node: Node) -> Camera:
 
 
 def _add_distortion_name(node: Node, count: int) -> Node:
-    """Return ROS' camera_info or OpenCV's FileStorage with the name of its distortion, which a flag
-    or the number of coefficients may tell.
+    """Return ROS' camera_info or OpenCV's FileStorage with the name of its distortion, which may be
+    derived from a flag or the number of coefficients.
     """
     flag = node.get("fisheye_model")
     if flag is not None:
@@ -401,14 +403,14 @@ def _add_distortion_name(node: Node, count: int) -> Node:
 
 
 def _pixels_of_shares(values: Values, size: tuple[int, int]) -> Values:
-    """Return pixels for shares of the image, which count from its corner."""
+    """Convert intrinsics in shares of the image's size, from its corner, to pixels."""
     width, height = size
     pixels = {"fx": values["fx"] * width, "fy": values["fy"] * height}
     return pixels | {"cx": values["cx"] * width - 0.5, "cy": values["cy"] * height - 0.5}
 
 
 def _ocam(node: Node) -> Values:
-    """Numbers of OCamCalib's "export data" (depth below zero) or py-OCamCalib's JSON."""
+    """Read the numbers of OCamCalib's "export data" or py-OCamCalib's JSON; a0 is negative."""
     if "taylor_coefficient" in node:
         depth = [-a for a in _floats(node["taylor_coefficient"], "taylor_coefficient")]
         stretch = _values(node, ["distortion_center: cx cy", "stretch_matrix: fx skew shear fy"])
@@ -428,11 +430,11 @@ def _ocam(node: Node) -> Values:
     return {f"a{i}": a for i, a in enumerate(depth)} | stretch
 
 
-# From the numbers of a file to our lens
+# Conversion to our lens
 
 
 def _size(node: Node) -> tuple[int, int] | None:
-    """Width and height [px]; None where the file does not say."""
+    """Return width and height [px]; None if the file does not contain them."""
     if "ocam_lines" in node:
         height, width = _floats(node["ocam_lines"][4], "height and width", 2)
         return int(width), int(height)
@@ -452,7 +454,7 @@ def _size(node: Node) -> tuple[int, int] | None:
 def _lens(
     model: str, values: Values, node: Node, asked_fov: float | None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Our lens, read or fitted, and what its numbers say against themselves."""
+    """Return our lens, read or fitted, and a report with warnings about the file's numbers."""
     remarks = []
     for name, value in values.items():
         if not math.isfinite(value):
@@ -474,7 +476,7 @@ def _lens(
         return lens, replace(report, remarks=(*remarks, *report.remarks))
     fx, fy, cx, cy, k1, k2, k3, k4 = (values[name] for name in KB4.split())
     limit = math.degrees(monotonic_limit((k1, k2, k3, k4)))
-    narrow = min(1.0, 1.9 * limit)  # until it is known how much the image sees
+    narrow = min(1.0, 1.9 * limit)  # until the image's field of view is computed
     lens = FisheyeParams(*size, fx, fy, cx, cy, k1, k2, k3, k4, narrow if fov is None else fov)
     if fov is None:
         lens = replace(lens, fov_deg=image_fov_deg(lens))
@@ -489,7 +491,7 @@ def _lens(
 def _fit_lens(
     model: str, values: Values, size: tuple[int, int], fov: float | None
 ) -> tuple[FisheyeParams, FitReport]:
-    """Fit our lens; ocam's polynomial needs to know how far the image reaches."""
+    """Fit our lens; for ocam's polynomial, the distance of the image's farthest corner is added."""
     core = model.partition("-")[0]
     if core == "ocam":
         x, y = values["cx"], values["cy"]
@@ -505,7 +507,7 @@ def _fit_lens(
 def _contradictions(
     model: str, values: Values, size: tuple[int, int], labelled: bool
 ) -> tuple[str, list[str]]:
-    """The model that a file's numbers are of, and what they say against their label."""
+    """Return the model of a file's numbers, and warnings about contradictions to its label."""
     names = values.keys() & {"k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"}
     remarks = []
     if names and not any(values[k] for k in names):

@@ -1,1 +1,1 @@
-"""Detection of ball and goal square on fisheye images."""
+"""Detection and tracking of ball and goal square on fisheye frames."""

@@ -1,13 +1,13 @@
-"""Ball and goal square on fisheye frames, by colour and shape, with OpenCV.
+"""Detection of ball and goal square on fisheye frames by colour and shape, with OpenCV.
 
-Colour proposes, geometry decides. A blob of the ball's hue is a ball if the edge around it lies on
-a circular cone of rays, as the outline of a ball does in every direction and under every lens; a
-blob of the goal's hue is the goal if its edges are four straight lines in the tangent plane of the
-rays, with a bright rim around. Edges are found to a fraction of a pixel where the colour has fallen
-to half its level just inside, so that blur moves them little.
+Colour gives candidates, which geometry accepts or rejects. A blob of the ball's hue is a ball if
+its edge is on a circular cone of rays, which is the shape of a ball's outline in every direction
+and for every lens. A blob of the goal's hue is the goal if its edges are four straight lines in the
+tangent plane of the rays, with a bright rim outside. Edges are located to a fraction of a pixel at
+about half of the colour's level inside, so that blur hardly moves them.
 
-The result is rays, not pixels: `convert_to_training_keypoints` makes of them what the training lens
-would have shown, by the functions that training calls."""
+The results are rays, not pixels. `convert_to_training_keypoints` projects them by the training
+lens, with the functions of training."""
 
 import math
 from dataclasses import dataclass
@@ -37,23 +37,25 @@ from camera.keypoints import (
 )
 
 ABOVE = 0.5
-"""Share of the ball's colour, as it is where the ball is expected, that a ground of its hue may
-have.
+"""Level of the background's colour relative to the level at the ball's expected position, for
+backgrounds of the ball's hue.
 """
 
 GATE = 4.0
-"""Standard deviations about each axis of where a thing is expected, within which it is looked for.
+"""Radius of the search region around an expected position, in standard deviations about each axis.
 """
 
 DISTANCE_ERROR = 0.15
-"""Of a ball's distance by the size of its cone, a far and blurred one [-]."""
+"""Relative error of a distant, blurred ball's distance as computed from the size of its cone
+[-].
+"""
 
 
 @dataclass(frozen=True)
 class DetectorParams(BoundedFields):
-    """The looks of ball and goal."""
+    """Appearance of ball and goal, and limits of the detector."""
 
-    # tennis ball: 62 to 68, and what a wrong white balance makes of it
+    # tennis ball: 62 to 68, with a tolerance for the white balance
     ball_hue_deg: tuple[float, float] = (46.0, 88.0)
     goal_hue_deg: tuple[float, float] = (105.0, 165.0)  # the green field of the square; as above
     saturation: Share = 0.3  # least share of colour in a pixel [-]
@@ -63,24 +65,26 @@ class DetectorParams(BoundedFields):
         0.84  # side of the goal's coloured field over that of the square with its rim [-]
     )
     coverage: Share = 0.35  # share of the ball's outline that must be visible
-    misfit: Positive = 0.1  # largest RMS of the outline from its cone, in half-angles
+    misfit: Positive = 0.1  # largest RMS distance of the outline from its cone, in half-angles
     side_tolerance: Positive = (
-        0.3  # of the goal's sides from what they must be where height and attitude are known [-]
+        0.3  # relative error of the goal's sides, tested if height and attitude are known [-]
     )
 
 
 @dataclass(frozen=True)
 class BallSeen:
-    """The ball as a cone of rays."""
+    """A detected ball as a cone of rays."""
 
     ray_c: ndarray  # unit, to the centre, shape (3,), camera frame
     half_angle: float  # [rad]
-    score: float  # share of the outline seen, less the misfit, less the way from where it was
+    # visible share of the outline minus the misfit, minus a penalty for the distance from where it
+    # was expected
+    score: float
 
 
 @dataclass(frozen=True)
 class GoalSeen:
-    """The goal square by its corners."""
+    """A detected goal square by its corners."""
 
     # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
     rays_c: ndarray
@@ -89,23 +93,23 @@ class GoalSeen:
 
 @dataclass(frozen=True)
 class FrameDetections:
-    """The ball and the goal of one frame; None where nothing was detected."""
+    """Detections in a frame; None for what was not detected."""
 
     ball: BallSeen | None
     goal: GoalSeen | None
-    squares: tuple[GoalSeen, ...] = ()  # all that may be the goal, the likeliest first
+    squares: tuple[GoalSeen, ...] = ()  # all candidates for the goal, the likeliest first
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior knowledge of a frame; each part may be missing."""
+    """Prior knowledge about a frame; each part may be missing."""
 
     up_c: ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
     height: float | None = (
         None  # of the lens above the ground [m]; with up_c the goal's size is checked
     )
     ball_distance: tuple[float, float] | None = (
-        None  # of the ball from the lens [m], narrower than the parameters'
+        None  # of the ball from the lens [m], instead of the parameters'
     )
     ball_ray_c: ndarray | None = None  # to where the ball is expected, unit, shape (3,)
     ball_within: float = math.radians(12.0)  # of ball_ray_c, `GATE` standard deviations [rad]
@@ -115,7 +119,7 @@ class Prior:
 
 
 class Detector:
-    """Finds ball and goal in frames of one lens."""
+    """Detector of ball and goal in the frames of a lens."""
 
     def __init__(
         self,
@@ -124,10 +128,10 @@ class Detector:
         goal_side: float,
         params: DetectorParams | None = None,
     ):
-        """Take the lens and the true sizes.
+        """Create a detector.
 
         Args:
-            lens: that took the frames.
+            lens: of the frames.
             payload_radius: [m]. goal_side: with the rim [m].
             params: colours and limits.
         """
@@ -141,11 +145,11 @@ class Detector:
         self._in_view = (plane < lens.edge_radius).astype(np.uint8)
 
     def detect(self, image: ndarray, prior: Prior | None = None) -> FrameDetections:
-        """Find ball and goal. Raises ValueError: an image of another size or type.
+        """Detect ball and goal. Raises ValueError: an image of another size or type.
 
         Args:
             image: BGR, uint8, shape (H, W, 3) of the lens.
-            known: narrows what is looked for.
+            prior: restricts the search.
         """
         self.check(image)
         p = self.params
@@ -158,7 +162,7 @@ class Detector:
         return FrameDetections(self._ball(*ball, prior), squares[0] if squares else None, squares)
 
     def check(self, image: ndarray) -> None:
-        """Raise ValueError for an image of another size or type."""
+        """Raise ValueError if an image has another size or type."""
         shape = (*self._in_view.shape, 3)
         if image.shape != shape or image.dtype != np.uint8:
             raise ValueError(
@@ -167,8 +171,8 @@ class Detector:
             )
 
     def _ball(self, mask: ndarray, level: ndarray, prior: Prior) -> BallSeen | None:
-        """The blob whose edge is the best cone; without one, the region at the ball's expected
-        position that stands out by its colour.
+        """Return the blob whose edge fits a cone best. If there is none, search for a distinct
+        colour at the ball's expected position.
         """
         best = self._best_cone(circles_of(mask), level, prior)
         if best is None and prior.ball_ray_c is not None:
@@ -192,7 +196,7 @@ class Detector:
         return best
 
     def _find_expected_ball(self, level: ndarray, prior: Prior) -> BallSeen | None:
-        """A ball in front of a ground or an object of its colour, near its expected position."""
+        """Search near the expected position for a ball in front of a background of its colour."""
         import cv2
 
         ray_c = np.ascontiguousarray(prior.ball_ray_c, np.float64)
@@ -204,15 +208,15 @@ class Detector:
         u, v = (int(x) for x in middle[0].round())
         patch = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
         ground = ABOVE * float(np.median(patch)) if patch.size else 0.0
-        # OpenCV's types leave a scalar out
+        # OpenCV's type annotations lack scalars
         distinct = cv2.subtract(level, ground)  # type: ignore[call-overload]
         mask = ((distinct > 0.0) & (self._in_view > 0)).astype(np.uint8)
         circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
         return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, prior)
 
     def _cone(self, level: ndarray, centre: ndarray, radius: float) -> BallSeen | None:
-        """The cone about a circle [px]; looked for again from where it was found, as part of a ball
-        may hide.
+        """Fit the cone of a ball around a circle [px]. The search is repeated from the result,
+        because part of the ball may be occluded.
         """
         best = None
         for _ in range(2):
@@ -235,7 +239,9 @@ class Detector:
         return best
 
     def _is_in_place(self, ray: ndarray, half_angle: float, prior: Prior) -> bool:
-        """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
+        """Return whether a cone is a possible ball, with the distance that its true radius
+        implies.
+        """
         distance = self.radius / max(math.sin(half_angle), 1e-9)
         low, high = prior.ball_distance or self.params.ball_distance
         if not low <= distance <= high:
@@ -246,13 +252,13 @@ class Detector:
             return False
         if prior.up_c is None or prior.height is None:
             return True
-        # A smaller thing on the ground would, were it the ball, lie below the ground.
+        # A smaller object on the ground would be below the ground if it had the ball's size.
         return prior.height + distance * float(ray @ prior.up_c) > -DISTANCE_ERROR * distance
 
     def _squares(
         self, mask: ndarray, level: ndarray, bright: ndarray, prior: Prior
     ) -> tuple[GoalSeen, ...]:
-        """The blobs that are squares with a rim, the best first."""
+        """Return the blobs that are squares with a rim, the best first."""
         squares = []
         for contour in outlines_of(mask):
             fit = fit_goal(self.lens, self.params.field_share, contour, level, bright)
@@ -261,8 +267,8 @@ class Detector:
         return tuple(sorted(squares, key=lambda square: -square.score))
 
     def _right_size(self, rays_c: ndarray, prior: Prior) -> bool:
-        """Whether the corners lie on the ground, a goal's side from one another; true where that
-        cannot be determined.
+        """Return whether the corners, projected to the ground, are a goal's side apart; true if
+        attitude or height is unknown.
         """
         if prior.up_c is None or prior.height is None:
             return True
@@ -275,15 +281,16 @@ class Detector:
 
 
 def order_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
-    """Corners in the order of `camera.keypoints.goal_square`, by where they lie on the ground.
+    """Sort corners in the order of `camera.keypoints.goal_square`, by their positions on the
+    ground.
 
     Args:
-        rays_c: to the corners, in turn about the square, shape (4, 3), camera frame; all below the
-            horizon.
+        rays_c: to the corners, in order around the square, shape (4, 3), camera frame; all below
+            the horizon.
         rot_wc: camera to world, shape (3, 3).
 
     Returns:
-        The same rays, shape (4, 3).
+        The sorted rays, shape (4, 3).
     """
     rays_w = rays_c @ rot_wc.T
     ground = rays_w[:, :2] / np.maximum(-rays_w[:, 2:], 1e-3)
@@ -299,17 +306,17 @@ def order_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
 def convert_to_training_keypoints(
     camera: KeypointCamera, detections: FrameDetections, rot_wb: ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Keypoints of the training camera from detections, by the functions that training calls.
+    """Compute the training camera's keypoints from detections, with the functions of training.
 
-    The ball's cone gives its distance, its true radius being known, and from there on the box is
-    training's own, with the bias that training's has: extremes are exact to second order in the
-    half-angle, 2.2e-4 of normalised coordinates at a rope's length. An outline that looks too large
-    by a share s thus moves each side of the box by s half-angles.
+    The ball's distance follows from its cone and its true radius. The box is then computed as in
+    training, with the same error: extremes are accurate to second order in the half-angle, 2.2e-4
+    in normalised coordinates at a rope's length. So if an outline is detected too large by a share
+    s, each side of the box moves by s half-angles.
 
     Args:
         camera: of training.
-        seen: in the camera frame of training.
-        rot_wb: attitude of the vehicle, body to world, shape (3, 3): says which corner is which.
+        detections: in the camera frame of training.
+        rot_wb: attitude of the vehicle, body to world, shape (3, 3), which identifies the corners.
 
     Returns:
         Normalised keypoints [-], shape (8, 2), and validity, shape (8,); zero and invalid where

@@ -1,4 +1,4 @@
-"""Edges of coloured things on a frame, to a fraction of a pixel, and the shapes through them.
+"""Sub-pixel edges of coloured objects on a frame, and fits of shapes to them.
 
 Used by `camera.detectors.contours`.
 """
@@ -16,31 +16,31 @@ from numpy.linalg import norm
 from camera.fisheye import Fisheye
 
 LEAST_AREA = 14  # blobs smaller than this are noise [px]
-MOST_PAIRED = 12  # largest blobs that are looked at in pairs
-SEARCH_MARGIN = 3.0  # how far beyond the goal's side its edge is looked for at least [px]
-ANGLES = 64  # directions in which a ball's edge is looked for
-STEP = 0.25  # between two samples across an edge [px]
-MOST_BENT = 0.12  # RMS of the goal's edge from its line, over the side
-# by which the goal's rim is brighter than what lies beyond, of that: blurred over its width by far
-# frames
+MOST_PAIRED = 12  # number of the largest blobs that are combined in pairs
+SEARCH_MARGIN = 3.0  # least reach of the search beyond a side of the goal [px]
+ANGLES = 64  # number of directions in which a ball's edge is searched
+STEP = 0.25  # distance of samples across an edge [px]
+MOST_BENT = 0.12  # largest RMS distance of the goal's edge from a line, over the side
+# least relative excess of the rim's brightness over its surroundings; low, because the rim is
+# blurred in distant frames
 LEAST_RIM = 0.05
-OVEREXPOSED = 245.0  # above this a pixel says nothing of how bright it is, of 255
-OUTER = 0.65  # quantile of an outline's distance from its axis about which points are kept
+OVEREXPOSED = 245.0  # level, of 255, above which a pixel counts as overexposed
+OUTER = 0.65  # quantile of the points' distances from a cone's axis around which points are kept
 RIM_LEVEL = 0.42
-"""Share of the fall at which a ball ends: below a half, as it darkens towards its rim; set on
-rendered balls, where the mean error of the half-angle then vanishes.
+"""Relative level of a ball's edge between outside and inside. It is below 0.5, because a ball is
+darker towards its edge. With it, the mean error of the half-angle on rendered balls is zero.
 """
-BLUR_WIDTH = 1.75  # half of the widest edge of a frame that is fit to be used [px]
+BLUR_WIDTH = 1.75  # half of the widest edge in a usable frame [px]
 SIDE_SAMPLES = 24  # samples along a side of the goal
-LEAST_LEVEL = 8.0  # colour inside an edge that is too faint to have one, of 255
+LEAST_LEVEL = 8.0  # least level of the colour inside an edge, of 255
 
 
 @dataclass(frozen=True)
 class Colours:
-    """A frame, smoothed against the sensor's noise: what all looks at it share."""
+    """A frame smoothed against the sensor's noise, in several representations."""
 
     bgr: tuple[ndarray, ndarray, ndarray]  # uint8, shape (H, W) each
-    hsv: ndarray  # uint8, hue 256 a turn, shape (H, W, 3)
+    hsv: ndarray  # uint8, hue from 0 to 255 for a full turn, shape (H, W, 3)
     bright: ndarray  # greatest channel, uint8, shape (H, W)
 
 
@@ -63,18 +63,18 @@ def colour_maps(
     in_view: ndarray,
     kind: Literal["yellow", "green"],
 ) -> tuple[ndarray, ndarray]:
-    """A colour's place in an image, and its amount.
+    """Return the mask and the level of a colour in an image.
 
     Args:
         colours: of the frame.
-        hue_deg: range of the hue [deg]. saturation, brightness: least ones, 0 to 1.
+        hue_deg: range of the hue [deg]. saturation, brightness: least values, 0 to 1.
         in_view: 1 inside the field of view, uint8, shape (H, W).
-        kind: which excess measures the colour: the lesser of red and green over blue, or green over
-            red and blue.
+        kind: definition of the level: the excess of the lesser of red and green over blue
+            ("yellow"), or of green over red and blue ("green").
 
     Returns:
-        Mask, uint8, shape (H, W), and the excess of 255, float32, shape (H, W): linear in the
-        light, so that an edge blurred by the lens crosses half of it where the edge is.
+        Mask, uint8, shape (H, W), and level, of 255, float32, shape (H, W). The level is linear in
+        the pixel values, so that at an edge blurred by the lens it is half of that inside.
     """
     import cv2
 
@@ -89,7 +89,7 @@ def colour_maps(
 
 
 def outlines_of(mask: ndarray) -> list[ndarray]:
-    """Outlines of the blobs of a mask [px], shape (N, 2) each."""
+    """Return the outlines of a mask's blobs [px], shape (N, 2) each."""
     import cv2
 
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -101,8 +101,8 @@ def outlines_of(mask: ndarray) -> list[ndarray]:
 
 
 def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
-    """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with
-    something across it.
+    """Return circles around the blobs of a mask, and around pairs of near blobs, which may be one
+    object that is partly occluded.
 
     Returns the centre [px], shape (2,), and radius [px] of each.
     """
@@ -123,14 +123,14 @@ def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
 
 
 def polar_edge(level: ndarray, centre: ndarray, radius: float) -> tuple[ndarray, float]:
-    """Edge of a disc, looked for outwards from its centre.
+    """Find the edge of a disc along rays from its centre.
 
     Args:
         level: of the colour, shape (H, W).
-        centre: [px], about. radius: [px], about.
+        centre: approximate [px]. radius: approximate [px].
 
     Returns:
-        Points of the edge [px], shape (N, 2), and their share of the directions.
+        Points on the edge [px], shape (N, 2), and the share of directions with a point.
     """
     reach = np.arange(0.3 * radius, 1.5 * radius + 4.0, STEP)
     angle = 2.0 * math.pi * np.arange(ANGLES) / ANGLES
@@ -142,23 +142,23 @@ def polar_edge(level: ndarray, centre: ndarray, radius: float) -> tuple[ndarray,
 
 
 def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
-    """Circular cone through rays: they meet the plane ``ray . n = 1`` where n is the axis over the
+    """Fit a circular cone to unit rays, which satisfy ``ray . n = 1`` with n the axis over the
     cosine of the half-angle.
 
     Args:
         rays: unit, shape (N, 3).
 
     Returns:
-        Axis, shape (3,), half-angle [rad], RMS of the misfit of the rays that belong to it in
-        half-angles, and their share.
+        Axis, shape (3,), half-angle [rad], RMS misfit of the inliers in half-angles, and the share
+        of inliers.
     """
     good = np.ones(len(rays), bool)
     axis = rays.mean(axis=0)
     half_angle = 0.0
     off = np.zeros(len(rays))
     for width in (0.4, 0.2, 0.1, 0.07, 0.07):
-        # About the mean ray the plane is nearly across; in its basis the least squares are well
-        # conditioned.
+        # The plane is nearly perpendicular to the mean ray, so that the least-squares problem is
+        # well conditioned in this basis.
         mean = rays[good].mean(axis=0)
         frame = _basis(mean / norm(mean))
         local = rays[good] @ frame
@@ -172,8 +172,8 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         half_angle = math.acos(1.0 / size)
         sine = norm(np.cross(rays, axis), axis=1)
         off = np.arctan2(sine, rays @ axis) / half_angle - 1.0
-        # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
-        # points count.
+        # Seams and occlusions only move points of the outline inwards, so the outer points are the
+        # inliers.
         inner = off[np.abs(off) < 0.5]
         outer = np.quantile(inner, OUTER) if len(inner) else 0.0
         good = np.abs(off - outer) < width
@@ -186,7 +186,7 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
 def fit_goal(
     lens: Fisheye, field_share: float, outline: ndarray, level: ndarray, bright: ndarray
 ) -> tuple[ndarray, float] | None:
-    """The goal by a blob's outline.
+    """Fit the goal square to a blob's outline.
 
     Args:
         lens: of the frame.
@@ -197,14 +197,14 @@ def fit_goal(
 
     Returns:
         Unit rays to the outer corners, clockwise in the image, shape (4, 3), and a score of at most
-        1; None where it is no square with a rim.
+        1; None if the blob is not a square with a rim.
     """
     rays = rays_of(lens, outline)
     centre = rays.mean(axis=0)
     frame = _basis(centre / norm(centre))
     local = rays @ frame
     if local[:, 2].min() < 0.3:
-        return None  # as wide as the whole view
+        return None  # too wide for a tangent plane
     corners = _quadrangle((local[:, :2] / local[:, 2:]).astype(np.float32))
     for _ in range(2):  # the second time from better corners
         refined = None if corners is None else _refine_corners(lens, corners, frame, level)
@@ -221,7 +221,9 @@ def fit_goal(
 
 
 def _quadrangle(points: ndarray) -> ndarray | None:
-    """Four corners about points of the tangent plane, clockwise in the image, shape (4, 2)."""
+    """Return the corners of a quadrangle around points of the tangent plane, clockwise in the
+    image, shape (4, 2).
+    """
     import cv2
 
     scale = float(np.abs(points).max())
@@ -245,8 +247,8 @@ def _quadrangle(points: ndarray) -> ndarray | None:
 def _refine_corners(
     lens: Fisheye, corners: ndarray, frame: ndarray, level: ndarray
 ) -> tuple[ndarray, float, float] | None:
-    """Corners by lines through the edges near each side; with the misfit over the side's length and
-    the share found.
+    """Refine corners by lines through the edges near each side. Returns the corners, the lines'
+    misfit over the side's length, and the share of samples with an edge.
     """
     lines = []
     misfit = []
@@ -285,7 +287,7 @@ def _refine_corners(
 
 
 def _line(points: ndarray) -> tuple[ndarray, float]:
-    """Line ``a x + b y = c`` (unit normal) through points, robustly, and their RMS from it."""
+    """Fit a line ``a x + b y = c`` (unit normal) robustly. Returns a, b, c and the RMS distance."""
     weights = np.ones(len(points))
     for _ in range(6):
         mean = np.average(points, axis=0, weights=weights)
@@ -308,7 +310,7 @@ def _meet(first: ndarray, second: ndarray) -> ndarray:
 
 
 def _scale_square(corners: ndarray, factor: float) -> ndarray:
-    """Corners of a square about its centre made larger, as the perspective that shows it has it."""
+    """Scale a square about its centre by ``factor``, under the perspective of its corners."""
     import cv2
 
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], np.float32)
@@ -323,7 +325,7 @@ def _rim_contrast(
     """Return the rim's brightness relative to its surroundings, minus one; the median along all
     sides.
 
-    Where both are overexposed nothing can be said, and the rim is taken for there.
+    If the surroundings are overexposed, a rim is assumed.
     """
     part = np.linspace(0.15, 0.85, 8)[:, None]
 
@@ -347,9 +349,7 @@ def _rim_contrast(
 
 
 def _pixels(lens: Fisheye, plane: ndarray, frame: ndarray) -> ndarray | None:
-    """Pixels of points of a tangent plane, shape (N, 2); None where one lies outside of
-    the view.
-    """
+    """Project points of a tangent plane to pixels, shape (N, 2); None if one is not visible."""
     rays = np.column_stack([plane, np.ones(len(plane))]) @ frame.T
     pixels, valid = lens.project(torch.from_numpy(rays))
     if bool((valid & lens.is_on_sensor(pixels)).all()):
@@ -358,13 +358,13 @@ def _pixels(lens: Fisheye, plane: ndarray, frame: ndarray) -> ndarray | None:
 
 
 def rays_of(lens: Fisheye, pixels: ndarray) -> ndarray:
-    """Unit rays through pixels [px], shape (N, 2): shape (N, 3), camera frame."""
+    """Return the unit rays, shape (N, 3), camera frame, of pixels [px], shape (N, 2)."""
     return lens.unproject(torch.from_numpy(np.ascontiguousarray(pixels, np.float64)))[0].numpy()
 
 
 def _basis(ray: ndarray) -> ndarray:
-    """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to
-    the camera.
+    """Return the rotation from the tangent plane of a unit ray to the camera frame, shape (3, 3);
+    its last column is the ray.
     """
     helper = np.array([1.0, 0.0, 0.0]) if abs(ray[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     x = helper - ray * (helper @ ray)
@@ -373,7 +373,7 @@ def _basis(ray: ndarray) -> ndarray:
 
 
 def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
-    """Bilinear values of a picture at pixels, shape of u."""
+    """Interpolate a picture bilinearly at pixels; returns the shape of u."""
     import cv2
 
     u, v = (np.ascontiguousarray(a, np.float32) for a in (u, v))
@@ -384,11 +384,10 @@ def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
 
 
 def _find_last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
-    """Outermost fall of each row from the level just inside to that just outside; whether there is
-    one, and where.
+    """Find the outermost falling edge of each row: return whether there is one, and its position.
 
-    A ball is darker towards its rim, so the levels are taken next to the edge, a blur's width away
-    from it."""
+    A ball is darker towards its edge. The levels inside and outside are therefore measured close to
+    the edge, at the blur's width."""
     plateau = np.quantile(values, 0.75, axis=1)
     threshold = 0.4 * plateau
     falls = _falls(values, threshold)
@@ -412,8 +411,8 @@ def _find_last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarr
 
 
 def _find_first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
-    """First fall of each row through half of its level at the start; whether there is one, and
-    where.
+    """Find where each row first falls below half of its level at the start: return whether it does,
+    and the position.
     """
     plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
     level = 0.5 * plateau
@@ -423,20 +422,20 @@ def _find_first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndar
 
 
 def _falls(values: ndarray, level: ndarray) -> ndarray:
-    """Whether each row falls through its level between a sample and the next one."""
+    """Return whether each row falls below its level between a sample and the next one."""
     above = values > level[:, None]
     return above[:, :-1] & ~above[:, 1:]
 
 
 def _index_of_last(marks: ndarray) -> ndarray:
-    """Index of the last mark of each row."""
+    """Return the index of the last true value of each row."""
     return marks.shape[1] - 1 - np.argmax(marks[:, ::-1], axis=1)
 
 
 def _interpolate_crossing(
     values: ndarray, reach: ndarray, index: ndarray, level: ndarray
 ) -> ndarray:
-    """Place between two samples where a level is crossed."""
+    """Return the position between two samples at which a level is crossed."""
     rows = np.arange(len(values))
     high = values[rows, index]
     low = values[rows, index + 1]

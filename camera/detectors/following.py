@@ -1,10 +1,11 @@
-"""Ball and goal from frame to frame: where they are looked for, what the ball reads while it is
-missed, and which square is the goal.
+"""Tracking of ball and goal over frames: predictions for the detector, a predicted ball where none
+is detected, and the choice of the square that is the goal.
 
-A ball is a direction in the world that turns. One that hangs is a pendulum: the vehicle's thrust
-drives its direction about the lens, the same gravity pulls both. What is not known of it is noise
-of a Kalman filter, whose spread says how far off a prediction can be. A square lies at a place on
-the ground, where what each frame says of it adds up; the likeliest of all is the goal."""
+The track of a ball is a direction in the world and its rate. A hanging ball is a pendulum: the
+vehicle's thrust accelerates its direction as seen from the lens, while gravity acts on both alike.
+A Kalman filter models unknown accelerations as noise; its standard deviation is the uncertainty of
+a prediction. A square has a fixed position on the ground, at which the evidence of all frames is
+accumulated. The likeliest square is the goal."""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,49 +17,53 @@ from numpy.linalg import norm
 from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
 
 READ = 0.01
-"""Of a direction in the world, about each axis: of the attitude, with which a detection is turned
-there, and of the detection [rad].
+"""Standard deviation of a measured direction in the world about each axis, from errors of attitude
+and detection [rad].
 """
 
-TURNS = 4.0  # rate of a ball that was detected once, about each axis [rad/s]
+TURNS = 4.0  # standard deviation of the rate after the first detection, about each axis [rad/s]
 
 DRIVEN = 8.0
-"""Of a direction's acceleration in each frame, about each axis, beyond a pendulum's [rad/s^2].
+"""Standard deviation of a direction's acceleration in each frame about each axis, in addition to
+that of a pendulum [rad/s^2].
 
-Set on 20 throws of the training simulator; on 10 of the realistic reference plant five blind frames
-are 2.7 deg off (rms), where the filter's spread about both axes says 2.8.
+Tuned on 20 throws of the training simulator. On 10 throws of the realistic reference plant, the
+error after five frames without a detection is 2.7 deg (rms); the filter's standard deviation over
+both axes is 2.8 deg.
 """
 
 THRUST = 14.0
 """Specific thrust of the vehicle [m/s^2]: median of throws of `vision`, which have 10 to 25; a
-hover has 12.5. The rest is in `DRIVEN`.
+hover has 12.5. `DRIVEN` includes the difference.
 """
 
 INITIAL_SPREADS = (0.05, 0.2)
-"""Of a ball that is said to hang still: direction [rad] and its rate [rad/s]."""
+"""Standard deviations of a ball that is stated to hang at rest: direction [rad] and rate
+[rad/s].
+"""
 
 LOST = 0.04
-"""Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by
-as much in a frame of a throw, and of the frames of training one in twenty is repeated.
+"""Standard deviation about each axis beyond which a prediction is not used [rad]. A ball moves as
+far in one frame of a throw, and one in twenty frames of training is repeated.
 """
 
 MEMORY = 2.0
-"""Time in which a frame's evidence of a square fades to 1/e, and after which an undetected one is
-forgotten [s]: a hover. A frame counts by the time since the one before, as frames err alike the
-closer they are.
+"""Time constant with which the evidence of a square decays, and time after which an undetected
+square is forgotten [s]: the duration of a hover. A frame is weighted by the time since the previous
+one, because the errors of close frames are correlated.
 """
 
-SUREST = 0.99  # probability of a square in one frame at most
+SUREST = 0.99  # largest probability of a square in one frame
 
 
 class BallTrack:
-    """A direction in the world, its rate and how well both are known; the same about each axis
-    across it.
+    """Kalman filter of a direction in the world and its rate, with equal covariance about both
+    axes perpendicular to it.
     """
 
     def __init__(self, ray_w: ndarray, stamp: float, spread: float, rate: float):
-        """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis
-        of it [rad] and its rate [rad/s].
+        """Start at a unit ray, shape (3,), and a time [s], with the standard deviations about each
+        axis of the direction [rad] and its rate [rad/s].
         """
         self.ray_w = ray_w
         self.rate_w = np.zeros(3)
@@ -71,8 +76,8 @@ class BallTrack:
         return math.sqrt(self._covariance[0, 0])
 
     def predict(self, stamp: float, driven_w: ndarray) -> None:
-        """Turn on to a time [s]; ``driven_w``: acceleration of the direction [rad/s^2],
-        shape (3,).
+        """Predict the direction at a time [s]; ``driven_w``: its acceleration [rad/s^2], shape
+        (3,).
         """
         dt = stamp - self.stamp
         self.stamp = stamp
@@ -83,7 +88,7 @@ class BallTrack:
         self._covariance = moved @ self._covariance @ moved.T + DRIVEN**2 * np.outer(push, push)
 
     def correct(self, ray_w: ndarray) -> None:
-        """Take in where it was seen, shape (3,), at the time that was predicted."""
+        """Update with a measured unit ray, shape (3,), at the time of the last prediction."""
         gain = self._covariance[:, 0] / (self._covariance[0, 0] + READ**2)
         off = _perpendicular(ray_w - self.ray_w, self.ray_w)
         self.ray_w = _unit(self.ray_w + gain[0] * off)
@@ -93,8 +98,8 @@ class BallTrack:
 
 @dataclass(eq=False)
 class Square:
-    """A possible goal: its last place on the ground [m], shape (2,), when [s], and its
-    log-odds by the frames so far.
+    """A candidate for the goal: last detected position on the ground [m], shape (2,), its time [s],
+    and the log-odds of all frames.
     """
 
     place_w: ndarray
@@ -103,11 +108,11 @@ class Square:
 
 
 class BallGoalTracker:
-    """Tracks of ball and goal in one camera."""
+    """Tracker of ball and goal for one camera."""
 
     def __init__(self, radius: float, side: float, ball_w: ndarray | None = None):
-        """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
-        lens [m], shape (3,), or with none.
+        """Start with the ball's radius and the goal's side [m], and optionally the position of a
+        ball at rest relative to the lens [m], shape (3,).
         """
         self._radius = radius
         self._side = side
@@ -130,10 +135,11 @@ class BallGoalTracker:
         """Return the prior knowledge for a frame.
 
         Args:
-            rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z, along which it thrusts,
-                shape (3,).
-            eye_w: the lens [m], shape (3,). distance: of a ball that hangs [m]; None: it does not.
-            stamp: of the frame [s].
+            rot_wc: camera to world, shape (3, 3). up_w: the vehicle's z axis, the direction of
+                thrust, shape (3,).
+            eye_w: position of the lens [m], shape (3,). distance: range of distances of a hanging
+                ball [m]; None: the ball does not hang.
+            stamp: time of the frame [s].
         """
         if self._begin is not None:
             length = float(norm(self._begin))
@@ -164,10 +170,10 @@ class BallGoalTracker:
     def take(
         self, detections: FrameDetections, rot_wc: ndarray | None, stamp: float
     ) -> FrameDetections:
-        """Return the detections of a frame, with a ball that was missed where it is predicted, and
-        of the squares the one that is the goal.
+        """Update the tracks with a frame's detections. Return these with the square that is the
+        goal, and with the predicted ball if none was detected.
 
-        Without an attitude nothing is followed.
+        Without an attitude, all tracks are deleted.
         """
         if rot_wc is None:
             self._ball = None
@@ -189,8 +195,8 @@ class BallGoalTracker:
         return detections
 
     def _goal(self, detections: FrameDetections, rot_wc: ndarray) -> GoalSeen | None:
-        """Add up what a frame says of squares, of which two are no nearer than a side; returns the
-        goal, unless it was missed.
+        """Add a frame's evidence to the squares, which are at least a side apart. Return the goal
+        if it was detected in this frame.
         """
         squares: dict[int, GoalSeen] = {}
         for one in detections.squares:  # the likeliest first
@@ -199,7 +205,7 @@ class BallGoalTracker:
             place_w = self._eye_w[:2] + ray_w[:2] * distance
             offsets = [square.place_w - place_w for square in self._squares]
             distances = [float(norm(offset)) for offset in offsets]
-            i = int(np.argmin([*distances, self._side]))  # the last: a new one
+            i = int(np.argmin([*distances, self._side]))  # the last index: a new square
             if i in squares:
                 continue
             if i == len(self._squares):
@@ -223,5 +229,5 @@ def _unit(vector: ndarray) -> ndarray:
 
 
 def _perpendicular(vector: ndarray, ray: ndarray) -> ndarray:
-    """The part of a vector across a unit ray."""
+    """Return the component of a vector perpendicular to a unit ray."""
     return vector - ray * (ray @ vector)

@@ -1,11 +1,12 @@
-"""Ball and goal square on fisheye frames by small learnt networks; beside
-`camera.detectors.contours`, with the same face.
+"""Detection of ball and goal square on fisheye frames by small neural networks, with the interface
+of `camera.detectors.contours`.
 
-One network looks at the whole frame, halved, and names places: for each cell of a grid whether a
-ball (a square) has its middle there, where in the cell and how large. Two others look at those
-places, each in a patch that is rectified about its ray, so that no lens bends it: how sure, where
-and how large exactly, and to what accuracy. What comes out are rays. Confidences are calibrated on
-pictures that were not trained on, and returned as probabilities."""
+One network searches the whole frame at half resolution. For each cell of a grid it predicts whether
+a ball (a square) has its centre there, its position in the cell and its size. Two other networks
+refine these places, each in a patch that is rectified around its ray and therefore free of the
+lens's distortion. They predict confidence, exact position and size, and their accuracy. The results
+are rays. Confidences are calibrated on pictures outside the training set, and returned as
+probabilities."""
 
 import json
 import math
@@ -30,14 +31,16 @@ KINDS = ("ball", "goal")
 PATCH = {"ball": 40, "goal": 56}  # side of a patch [px]
 
 REACH = {"ball": 2.2, "goal": 1.9}
-"""Half side of a patch over the size: the ball's half-angle, the mean angle from the square's
-middle to its corners.
+"""Half side of a patch over the object's size: the ball's half-angle, or the mean angle from the
+square's centre to its corners.
 """
 
 LEAST_REACH = 0.05
-"""Half side of a patch at least, as a tangent: what is far is looked at with its surroundings."""
+"""Smallest half side of a patch, as a tangent, so that patches of distant objects include their
+surroundings.
+"""
 
-PLACES = 3  # of a kind that are looked at closely
+PLACES = 3  # number of places of each kind that are refined
 
 LEAST_PROBABILITY = 0.5
 
@@ -47,8 +50,8 @@ def _block(inward: int, outward: int, stride: int) -> nn.Sequential:
 
 
 class FrameNetwork(nn.Module):
-    """Whole frames, halved, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W / 16): logit, place in the
-    cell [cells] and log size [cells].
+    """Network from whole frames at half resolution, (B, 3, H / 2, W / 2), to (B, 2, 4, H / 16, W /
+    16): logit, position relative to the cell's centre [cells] and log size [cells].
     """
 
     def __init__(self) -> None:
@@ -63,15 +66,15 @@ class FrameNetwork(nn.Module):
             nn.Conv2d(40, 8, 1),
         )
         with torch.no_grad():
-            self.body[-1].bias[0::4] = -5.0  # few cells of a frame show anything
+            self.body[-1].bias[0::4] = -5.0  # few cells of a frame contain an object
 
     def forward(self, frames: Tensor) -> Tensor:
         return self.body(frames).unflatten(1, (2, 4))
 
 
 class PatchNetwork(nn.Module):
-    """Patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and what is where, in half sides
-    of the patch.
+    """Network from patches (B, 3, S, S) to (B, outputs): logit, log accuracy, and the object's
+    geometry in half sides of the patch.
     """
 
     def __init__(self, side: int, outputs: int):
@@ -93,11 +96,11 @@ class PatchNetwork(nn.Module):
 
 
 class Networks(nn.Module):
-    """The three networks, and how their confidences are calibrated.
+    """The three networks, and the calibration of their confidences.
 
     Attributes:
-        calibration: by kind, factor and offset of the logits, and factor of the accuracies.
-        made_by: what they were trained with.
+        calibration: kind -> factor and offset of the logits, and factor of the accuracies.
+        made_by: provenance of the training.
     """
 
     def __init__(self) -> None:
@@ -109,8 +112,8 @@ class Networks(nn.Module):
         self.made_by: dict = {}
 
     def save(self, path: str | Path) -> None:
-        """Write an ``.npz`` without pickle: the weights in half precision, and ``header``, JSON
-        text.
+        """Write an ``.npz`` without pickle: the weights in half precision, and a JSON text
+        ``header``.
         """
         header = {
             "format_version": FORMAT,
@@ -126,7 +129,7 @@ class Networks(nn.Module):
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> "Networks":
-        """Read what `save` wrote. Raises ValueError: no such file, or not of this format."""
+        """Read a file of `save`. Raises ValueError: no such file, or another format."""
         networks = Networks()
         try:
             with np.load(path, allow_pickle=False) as arrays:
@@ -148,39 +151,39 @@ class Networks(nn.Module):
 
 
 def halve(frames: Tensor) -> Tensor:
-    """Frames as the search sees them:
+    """Convert frames, uint8, (B, H, W, 3), to the input of the search:
 
-    RGB in -1 to 1, (B, 3, H / 2, W / 2), of uint8 (B, H, W, 3).
+    RGB in -1 to 1, (B, 3, H / 2, W / 2).
     """
     return F.avg_pool2d(frames.permute(0, 3, 1, 2).float(), 2) / 127.5 - 1.0
 
 
 @dataclass(frozen=True)
 class Views:
-    """Patches about rays: an orthonormal frame each, and the half side."""
+    """Rectified patches around rays, each with an orthonormal frame and a half side."""
 
     axes: Tensor  # rows right, down, ahead, shape (B, 3, 3), camera frame
     reach: Tensor  # half side as a tangent, shape (B,)
 
     def rays(self, points: Tensor) -> Tensor:
-        """Unit rays (B, K, 3) through points in half sides (B, K, 2)."""
+        """Return the unit rays (B, K, 3) of points in half sides (B, K, 2)."""
         lateral = points * self.reach[:, None, None]
         axial = torch.cat([lateral, torch.ones_like(lateral[..., :1])], -1)
         return F.normalize(axial @ self.axes, dim=-1)
 
     def points(self, rays: Tensor) -> Tensor:
-        """The inverse of `rays`, of rays less than a right angle off (B, K, 3)."""
+        """Invert `rays` for rays (B, K, 3) less than 90 deg off the axis."""
         local = rays @ self.axes.transpose(1, 2)
         depth = local[..., 2:].clamp(min=1e-3)
         return local[..., :2] / (depth * self.reach[:, None, None])
 
 
 def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
-    """Patches about unit rays, shape (B, 3), upright along a direction in the camera frame, shape
-    (B, 3).
+    """Return patches around unit rays, shape (B, 3), whose up direction is ``north_c``, camera
+    frame, shape (B, 3).
 
-    The world's x where the attitude is known, so that a square that is laid along the world's axes
-    shows its corners in one order."""
+    If the attitude is known, this is the world's x axis, so that the corners of a square parallel
+    to the world's axes are always in the same order."""
 
     def perpendicular(vector: Tensor) -> Tensor:
         return vector - (vector * rays).sum(-1, keepdim=True) * rays
@@ -194,7 +197,7 @@ def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
 
 
 def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side: int) -> Tensor:
-    """Rectified patches, RGB in -1 to 1, shape (B, 3, S, S).
+    """Return rectified patches, RGB in -1 to 1, shape (B, 3, S, S).
 
     Args:
         frames: RGB, uint8, shape (F, H, W, 3). index: frame of each patch, shape (B,).
@@ -220,8 +223,8 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
 
 
 class LearntDetector(Detector):
-    """Finds ball and goal in frames of one lens by the networks; what is known narrows it as it
-    does the OpenCV detector.
+    """Detector of ball and goal in the frames of a lens by the networks. Prior knowledge restricts
+    the search as in the OpenCV detector.
     """
 
     def __init__(
@@ -232,9 +235,9 @@ class LearntDetector(Detector):
         params=None,
         networks: Networks | None = None,
     ):
-        """Take the lens, the true sizes and the networks; left out, those that are shipped.
+        """Create a detector from lens, true sizes and networks, by default the shipped ones.
 
-        Raises ValueError: a frame whose sides are no multiples of a cell.
+        Raises ValueError: the sides of the frame are not multiples of a cell.
         """
         super().__init__(lens, payload_radius, goal_side, params)
         if lens.params.height % CELL or lens.params.width % CELL:
@@ -246,7 +249,7 @@ class LearntDetector(Detector):
 
     @torch.inference_mode()
     def detect(self, image: np.ndarray, prior: Prior | None = None) -> FrameDetections:
-        """Find ball and goal; see `camera.detectors.contours.Detector.detect`."""
+        """Detect ball and goal; see `camera.detectors.contours.Detector.detect`."""
         self.check(image)
         prior = prior or Prior()
         frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
@@ -261,7 +264,7 @@ class LearntDetector(Detector):
     def _closest(
         self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Probabilities and findings at places."""
+        """Refine places: return probabilities and balls or corners."""
         factor, offset, _ = self.networks.calibration[kind]
         places = (rays, sizes, self.lens, north)
         views, outputs, _, _ = look_closely(self.networks, kind, frames, *places)
@@ -283,8 +286,8 @@ class LearntDetector(Detector):
         return None
 
     def _squares(self, probability: Tensor, things: Tensor, prior: Prior) -> tuple[GoalSeen, ...]:
-        """Return detections that are certain, or certain where expected, the likeliest first; each
-        by its own probability, which frames add up.
+        """Return the squares that are certain, alone or near the expected position, the likeliest
+        first. Their scores are the networks' probabilities, because the tracker accumulates frames.
         """
         middles = F.normalize(things.mean(1), dim=-1)
         expected = (prior.goal_ray_c, prior.goal_within)
@@ -300,11 +303,11 @@ class LearntDetector(Detector):
     def _raise_near(
         self, probability: Tensor, rays: Tensor, expected_c: np.ndarray | None, tolerance: float
     ) -> Tensor:
-        """Probabilities where it is known about where the thing is; the networks' own are of a
-        thing that can be anywhere in view.
+        """Update the networks' probabilities, which assume any position in the view, with an
+        expected position.
 
-        Bayes' rule: the odds grow by the normal density of where it is expected over the even one
-        in the view's solid angle."""
+        Bayes' rule: the odds are multiplied by the ratio of the normal density around the expected
+        position to the uniform density over the view's solid angle."""
         if expected_c is None:
             return probability
         cosine = rays @ torch.from_numpy(expected_c).float()
@@ -325,10 +328,10 @@ def look_closely(
     lens: Fisheye,
     north: Tensor,
 ) -> tuple[Views, Tensor, Tensor, Tensor]:
-    """Patches about places of one frame, what the network of a kind makes of them, shape (B,
-    outputs), and `middle_of` that.
+    """Refine places of one frame. Return the patches, the outputs of the kind's network, shape (B,
+    outputs), and the rays and sizes of `middle_of`.
 
-    They are looked at twice: the second patch lies where the first found the thing.
+    This is done twice: the second patch is centred on the object found in the first.
     """
     index = torch.zeros(len(rays), dtype=torch.long, device=rays.device)
     for _ in range(2):
@@ -341,7 +344,7 @@ def look_closely(
 
 
 def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]:
-    """Ray to the middle, shape (B, 3), and size [rad], shape (B,), of what was found."""
+    """Return the rays to the objects' centres, shape (B, 3), and their sizes [rad], shape (B,)."""
     if kind == "ball":
         thing = ball_of(views, outputs)
         return thing[:, :3], thing[:, 3]
@@ -352,22 +355,22 @@ def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]
 
 
 def corners_of(views: Views, outputs: Tensor) -> Tensor:
-    """Unit rays to the corners of squares, shape (B, 4, 3)."""
+    """Return unit rays to the corners of squares, shape (B, 4, 3)."""
     return views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
 
 
 def ball_of(views: Views, outputs: Tensor) -> Tensor:
-    """Unit ray and half-angle [rad] of balls, shape (B, 4)."""
+    """Return unit rays and half-angles [rad] of balls, shape (B, 4)."""
     ray = views.rays(outputs[:, None, 2:4])[:, 0]
     half_angle = views.reach / REACH["ball"] * outputs[:, 4].clamp(-3.0, 1.5).exp()
     return torch.cat([ray, half_angle[:, None].clamp(1e-3, 1.2)], -1)
 
 
 def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
-    """Likeliest places in one frame by kind: rays (PLACES, 3), and sizes [rad] (PLACES,).
+    """Return kind -> likeliest places in one frame: rays (PLACES, 3), and sizes [rad] (PLACES,).
 
     Args:
-        grids: of `Search`, shape (1, 2, 4, h, w). lens: of the frame.
+        grids: of `FrameNetwork`, shape (1, 2, 4, h, w). lens: of the frame.
     """
     places = {}
     for k, kind in enumerate(KINDS):
@@ -380,10 +383,10 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 def places_in(grids: Tensor, frames: Tensor, cells: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
-    """Unit rays (B, 3) and sizes [rad] (B,) that cells name.
+    """Return the unit rays (B, 3) and sizes [rad] (B,) that cells predict.
 
     Args:
-        grids: of one kind, shape (F, 4, h, w). frames, cells: which frame, and which of its cells
+        grids: of one kind, shape (F, 4, h, w). frames, cells: indices of the frame and of its cell,
             counted row by row, shape (B,).
         lens: of the frames.
     """
@@ -400,10 +403,10 @@ def places_in(grids: Tensor, frames: Tensor, cells: Tensor, lens: Fisheye) -> tu
 
 
 def log_size(angle: Tensor, lens: Fisheye) -> Tensor:
-    """Sizes [rad] as `Search` tells them."""
+    """Convert sizes [rad] to the log sizes of `FrameNetwork`."""
     return (angle.clamp(min=1e-4) * (lens.params.fx / CELL)).log()
 
 
 def spread_of(outputs: Tensor, views: Views) -> Tensor:
-    """Standard deviation of a direction [rad], before calibration, shape (B,)."""
+    """Return the standard deviation of a direction [rad], before calibration, shape (B,)."""
     return outputs[:, 1].clamp(-8.0, 3.0).exp() * views.reach
