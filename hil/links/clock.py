@@ -1,4 +1,4 @@
-"""Time: the monotonic clock, ticks on it, and the offset of a peer's clock."""
+"""Clocks, ticks, and the offset of a peer's clock."""
 
 import math
 import select
@@ -10,25 +10,23 @@ from typing import Any
 
 
 class Clock:
-    """A clock that never goes back."""
+    """A clock that never goes backwards."""
 
     def now(self) -> float:
         """Return the time [s]."""
         raise NotImplementedError
 
     def wait_for(self, files: Sequence[Any], when: float) -> None:
-        """Wait until there is something to read from a file (anything with ``fileno``), or until a
-        time [s].
-        """
+        """Wait until a file (any object with ``fileno``) can be read, or until a time [s]."""
         raise NotImplementedError
 
     def sleep_until(self, when: float) -> None:
-        """Wait until a time [s]; at once where it has passed."""
+        """Wait until a time [s]; return at once if it has passed."""
         self.wait_for((), when)
 
 
 class MonotonicClock(Clock):
-    """The machine's monotonic clock; at ``speed`` 0.5 its second takes two."""
+    """The machine's monotonic clock times ``speed``: at 0.5, one of its seconds takes two."""
 
     def __init__(self, speed: float = 1.0):
         """Set the speed; raises `ValueError` for 0 or less."""
@@ -47,7 +45,7 @@ class MonotonicClock(Clock):
 
 @dataclass
 class ManualClock(Clock):
-    """A clock that is where it was put: for tests and replay."""
+    """A clock that only moves when it is set or waited for: for tests and replay."""
 
     time: float = 0.0  # [s]
 
@@ -60,14 +58,15 @@ class ManualClock(Clock):
 
 @dataclass
 class Ticker:
-    """Ticks at fixed times, start + n period; a tick that comes more than a period late skips those
-    it missed.
+    """Ticks at fixed times, start + n period; a tick that is more than a period late skips those
+    that it missed.
 
     Attributes:
-        grid: offset of a clock at whose multiples of the period the ticks are [s]; None: at any.
-        index: number of the current tick, missed ones counted. missed: ticks that were skipped.
-        late: how late the current tick is, after those it skipped [s]. worst: the longest wait of
-            any tick [s].
+        grid: offset of a clock; ticks are at multiples of the period on that clock [s]. None: no
+            such grid.
+        index: number of the current tick, including missed ticks. missed: ticks that were skipped.
+        late: lateness of the current tick, after skipping missed ones [s]. worst: largest lateness
+            of any tick [s].
     """
 
     clock: Clock
@@ -89,7 +88,7 @@ class Ticker:
         return self._start + (self.index + 1) * self.period
 
     def take(self) -> float:
-        """Begin the tick that is due; returns the time now [s]."""
+        """Begin the tick that is due; return the current time [s]."""
         due = self.due()
         time = self.clock.now()
         lag = max(0.0, time - due)
@@ -102,15 +101,15 @@ class Ticker:
 
 
 class TimeSync:
-    """Offset of a peer's clock by TIMESYNC, from the exchange with the shortest round trip;
-    ``steps``: how often a clock was set.
+    """Estimates the offset of a peer's clock by TIMESYNC, from the exchange with the shortest round
+    trip; ``steps`` counts steps of either clock.
 
     The peer answers ``tc1`` (its time) to ``ts1`` (ours). The true offset lies within half the
     round trip of ``tc1 - (sent + received) / 2``, so the shortest exchange is the best one.
-    Exchanges that contradict it, by more than both round trips and some drift allow, are set aside;
-    several in a row say that a clock was set, and begin anew."""
+    Exchanges that contradict it by more than the round trips and some drift explain are ignored;
+    after several in a row a clock was set, and the estimate starts again."""
 
-    DRIFT = 1e-3  # that clocks may part by within the window: 200 parts in a million over 5 s [s]
+    DRIFT = 1e-3  # of the clocks within the window: 200 parts in a million over 5 s [s]
     STEP_AFTER = 3  # contradicting exchanges in a row that make a step
 
     def __init__(self) -> None:
@@ -120,12 +119,12 @@ class TimeSync:
 
     @staticmethod
     def stamp(host_time: float) -> int:
-        """Return a time [s] as TIMESYNC has it [ns]."""
+        """Return a time [s] in TIMESYNC's unit [ns]."""
         return int(host_time * 1e9)
 
     def take(self, tc1: int, ts1: int, host_time: float) -> None:
-        """Take the answer to a request of ours, at a time [s]: the peer's time and the request's
-        [ns].
+        """Process the answer to a request, received at a time [s]; ``tc1``: the peer's time,
+        ``ts1``: ours in the request [ns].
         """
         sent = ts1 / 1e9
         trip, offset = host_time - sent, tc1 / 1e9 - 0.5 * (sent + host_time)
@@ -143,7 +142,7 @@ class TimeSync:
 
     @property
     def offset(self) -> float | None:
-        """Peer's clock less ours [s]; None before the first answer."""
+        """Peer's clock minus ours [s]; None before the first answer."""
         return min(self._exchanges)[1] if self._exchanges else None
 
     @property

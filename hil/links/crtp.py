@@ -1,8 +1,8 @@
-"""CRTP, the Crazyflie's packets: ports, their layout, and the links that carry them.
+"""CRTP, the Crazyflie's protocol: its packets and the links that carry them.
 
-A packet is a header, port in the high half and channel in the low two bits, and up to 30 bytes. On
-``udpout:`` devices each datagram is a packet, as cflib's UDP driver and Bitcraze's software in the
-loop have it; ``radio://`` and ``usb://`` addresses go through cflib.
+A packet is a header byte, with the port in the high half and the channel in the low two bits, and
+up to 30 bytes of data. On ``udpout:`` devices each datagram is a packet, as in cflib's UDP driver
+and Bitcraze's software in the loop; ``radio://`` and ``usb://`` addresses use cflib.
 
 Source: `hil.links.facts`, crazyflie; cflib, crtp/udpdriver.py."""
 
@@ -33,25 +33,25 @@ class Packet:
     data: bytes
 
     def pack(self) -> bytes:
-        """Return its bytes as they go out."""
+        """Return the bytes to send."""
         return bytes([self.port << FACTS["header_shift"] | self.channel & 3]) + self.data
 
 
 def message(port: str, channel: str, data: bytes) -> bytes:
-    """Return the packet of a port and a channel by their names among the facts."""
+    """Return the bytes of a packet; ``port`` and ``channel``: their names among the facts."""
     return Packet(FACTS[port], FACTS[channel], data).pack()
 
 
 def unpack(data: bytes) -> Packet | None:
-    """Return the packet of some bytes; None where they are none."""
+    """Return the packet in some bytes; None if they are not a packet."""
     if not 1 <= len(data) <= MOST:
         return None
     return Packet(data[0] >> FACTS["header_shift"], data[0] & 3, data[1:])
 
 
 def manual(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
-    """Return the manual set-point in rate mode: thrust of 65535, body rates forward, left, up
-    [deg/s].
+    """Return a manual set-point in rate mode: thrust, 0 to 65535, and body rates forward, left,
+    up [deg/s].
     """
     axes = zip(rates_dps, ("roll", "pitch", "yaw"))
     signed = (FACTS[f"manual_{axis}_sign"] * rate for rate, axis in axes)
@@ -60,24 +60,26 @@ def manual(thrust: int, rates_dps: tuple[float, float, float]) -> bytes:
 
 
 def position(place_w: tuple[float, ...], yaw_deg: float) -> bytes:
-    """Return the set-point of a place [m], z up, and heading [deg] that it is to hold by itself."""
+    """Return a position set-point [m], z up, with heading [deg], which the vehicle holds by
+    itself.
+    """
     data = POSITION.pack(FACTS["position"], *place_w, yaw_deg)
     return message("port_generic", "channel_set_point", data)
 
 
 def external_pose(pos: tuple[float, ...], quat: tuple[float, ...]) -> bytes:
-    """Return the position [m], z up, and attitude xyzw for its estimator."""
+    """Return a packet with position [m], z up, and attitude xyzw for the vehicle's estimator."""
     data = POSE.pack(FACTS["external_pose"], *pos, *quat)
     return message("port_localization", "channel_pose", data)
 
 
 def encode_name(name: str) -> bytes:
-    """Return a parameter's name ``group.name`` as packets have it."""
+    """Return a parameter's name ``group.name`` as encoded in packets."""
     return name.replace(".", "\0").encode() + b"\0"
 
 
 def set_parameter(name: str, value: int) -> bytes:
-    """Return a parameter of eight bits, by its name."""
+    """Return a packet that sets an eight-bit parameter by its name."""
     data = bytes([FACTS["set_by_name"]]) + encode_name(name) + bytes([FACTS["type_uint8"], value])
     return message("port_param", "channel_by_name", data)
 
@@ -89,12 +91,12 @@ def arm(on: bool) -> bytes:
 
 
 def ask_state() -> bytes:
-    """Return the question for the supervisor's state."""
+    """Return the request for the supervisor's state."""
     return message("port_supervisor", "channel_info", bytes([FACTS["ask_state"]]))
 
 
 def ask_protocol() -> bytes:
-    """Return the question for the protocol's version."""
+    """Return the request for the protocol's version."""
     return message("port_platform", "channel_version", bytes([FACTS["ask_protocol"]]))
 
 
@@ -104,7 +106,7 @@ class CflibPort(Port):
     whole = True
 
     def __init__(self, address: str):
-        """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""
+        """Open the link. Raises `LinkError`: cflib is missing, or the link cannot be opened."""
         crtp = load_extra("cflib.crtp", "crazyflie", f"the Crazyflie at {address}", LinkError)
         self._packet = load_extra(
             "cflib.crtp.crtpstack", "crazyflie", "the Crazyflie", LinkError
@@ -135,7 +137,7 @@ class CflibPort(Port):
         return self.lost is None
 
     def fileno(self) -> int:
-        """Return -1: its packets come by a thread; nothing can be waited for."""
+        """Return -1: a thread receives the packets, so there is no file to wait for."""
         return -1
 
 

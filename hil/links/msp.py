@@ -1,8 +1,8 @@
-"""MSP, the serial protocol of Betaflight: frames of version 1, in which it answers what was asked
-in it, to bytes and back.
+"""MSP, the serial protocol of Betaflight: encoder and parser of frames of version 1.
 
-``$M``, direction, length, command, payload, XOR of length to payload. Directions: ``<`` to the
-flight controller, ``>`` its answer, ``!`` its refusal. Numbers are little-endian.
+The firmware answers in the version of the request. A frame is ``$M``, direction, length, command,
+payload, and XOR of length to payload. Directions: ``<`` to the flight controller, ``>`` its answer,
+``!`` its refusal. Numbers are little-endian.
 
 Source: betaflight, src/main/msp/msp_serial.c and msp_protocol.h.
 """
@@ -31,8 +31,8 @@ EEPROM_WRITE = FACTS["MSP_EEPROM_WRITE"]
 TO_CONTROLLER = b"<"
 ANSWER = b">"
 REFUSAL = b"!"
-MOST_PAYLOAD = FACTS["jumbo"] - 1  # answers that are used here have some forty bytes
-START = FACTS["frame_start"]  # of what the checksum goes over
+MOST_PAYLOAD = FACTS["jumbo"] - 1  # the answers used here have some forty bytes
+START = FACTS["frame_start"]  # of the bytes in the checksum
 HEAD = START + 2  # bytes before the payload
 
 
@@ -45,19 +45,19 @@ class Frame:
     direction: bytes = TO_CONTROLLER
 
     def number(self, code: str, at: int) -> int | None:
-        """Return the number at a place, coded as of `struct`; None beyond the end."""
+        """Return the number at an offset, with a format code of `struct`; None beyond the end."""
         try:
             return struct.unpack_from(code, self.payload, at)[0]
         except struct.error:
             return None
 
     def words(self) -> tuple[int, ...]:
-        """Return the payload as numbers of two bytes; an odd last byte is left out."""
+        """Return the payload as 16-bit numbers; an odd last byte is left out."""
         return struct.unpack_from(f"<{len(self.payload) // 2}H", self.payload)
 
 
 def pack(frame: Frame) -> bytes:
-    """Return bytes of a frame; raises `ValueError` where command or payload are too large."""
+    """Return the bytes of a frame. Raises `ValueError`: command or payload is too large."""
     count = len(frame.payload)
     if not (0 <= frame.command <= 255 and count <= MOST_PAYLOAD):
         raise ValueError(
@@ -69,14 +69,14 @@ def pack(frame: Frame) -> bytes:
 
 
 def xor(data: bytes) -> int:
-    """Return the checksum of bytes."""
+    """Return the XOR checksum of bytes."""
     return reduce(operator.xor, data, 0)
 
 
 class FrameParser:
-    """Bytes of a stream to frames.
+    """A parser of frames in a stream of bytes.
 
-    No byte string makes it raise; ``errors`` counts what looked like a frame and was none.
+    It never raises; ``errors`` counts apparent frames that were invalid.
     """
 
     def __init__(self) -> None:
@@ -84,7 +84,7 @@ class FrameParser:
         self._buffer = bytearray()
 
     def parse(self, data: bytes) -> list[Frame]:
-        """Return frames that are complete by now."""
+        """Add bytes; return the frames that they complete."""
         buffer = self._buffer
         frames = []
         buffer += data
@@ -92,13 +92,13 @@ class FrameParser:
             del buffer[:start]
             if buffer[1:2] in (b"", b"M") and (len(buffer) < 3 or buffer[2] in b"<>!"):
                 if len(buffer) <= START or len(buffer) <= (end := HEAD + buffer[START]):
-                    return frames  # more is to come
+                    return frames  # incomplete
                 if xor(buffer[START:end]) == buffer[end]:
                     payload = bytes(buffer[HEAD:end])
                     frames.append(Frame(buffer[START + 1], payload, bytes(buffer[2:3])))
                     del buffer[: end + 1]
                     continue
             self.errors += 1
-            del buffer[:1]  # look for the next beginning right behind this one
+            del buffer[:1]  # search on right after this start
         buffer.clear()
         return frames

@@ -1,11 +1,11 @@
-"""The one place that imports pymavlink, after MAVLink 2 was asked for: a parser that never raises,
-and signed messages.
+"""The only module that imports pymavlink, with MAVLink 2 selected: a parser that never raises, and
+signed messages.
 
-A signature is the first six bytes of SHA-256 over key, message and a time stamp that only grows, so
-that nothing can be sent again.
+A signature is the first six bytes of SHA-256 over key, message and an increasing time stamp, which
+prevents replays.
 
-Source: mavlink.io, Message Signing (time stamps of 10 us since 2015-01-01; a new stream may be a
-minute behind)."""
+Source: mavlink.io, Message Signing (time stamps in units of 10 us since 2015-01-01; a new stream
+may be a minute behind)."""
 
 import hashlib
 import hmac
@@ -18,26 +18,26 @@ from pathlib import Path
 
 from hil.errors import LinkError
 
-os.environ["MAVLINK20"] = "1"  # pymavlink speaks version 1 without it, which cannot carry ODOMETRY
+os.environ["MAVLINK20"] = "1"  # default is version 1, without ODOMETRY
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 __all__ = ["Parser", "mav"]
 
-FORGED = (  # what pymavlink calls a message without a valid signature, where one is asked for
+FORGED = (  # pymavlink's reason for a message without a valid signature, if one is required
     "Invalid signature"
 )
 
 
 class Parser:
-    """Bytes to messages; no byte string makes it raise.
+    """A parser of MAVLink messages that never raises.
 
-    ``errors`` counts what was no message, or only in part; ``forged`` are messages of the last
-    bytes without a valid signature.
+    ``errors`` counts invalid and incomplete messages; ``forged`` holds the messages of the last
+    call without a valid signature.
     """
 
     def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)):
-        """Take what makes pymavlink's parser, which may ask for signatures."""
+        """Use a factory of pymavlink's parser, which may require signatures."""
         self.errors = 0
         self._make = make
         self.forged: list[bytes] = []
@@ -48,13 +48,13 @@ class Parser:
         self._mav.robust_parsing = True
 
     def parse(self, data: bytes, whole: bool = True) -> list:
-        """Return messages in a byte string: a whole datagram, of which nothing is kept for the next
-        one, or a piece of a stream.
+        """Return the messages in some bytes: a whole datagram, after which nothing is kept for
+        the next call, or a piece of a stream.
         """
         self.forged = []
         try:
             parsed = self._mav.parse_buffer(data) or []
-        except Exception:  # pymavlink's state is not to be trusted afterwards
+        except Exception:  # pymavlink's state is unreliable afterwards
             self.errors += 1
             self._fresh()
             return []
@@ -73,18 +73,18 @@ class Parser:
 
 SIGNATURE = struct.Struct("<B6s6s")  # at a message's end: link id, time [10 us], signature
 KEY_BYTES = 32
-TICKS = 100_000  # of a signature's time a second
+TICKS = 100_000  # units of a signature's time per second
 EPOCH = 1_420_070_400.0  # 2015-01-01, where time stamps of signatures begin [s since 1970]
-# that the first message of a stream may be behind our clock: a minute, in units of 10 us
+# by which the first message of a stream may be behind our clock: a minute, in units of 10 us
 LAG_LIMIT = 6_000_000
-MOST_STREAMS = 256  # streams of valid signatures; more than 255 link ids of one sender are none
-LEAST_WORD = 8  # characters of a pass phrase
+MOST_STREAMS = 256  # most streams of valid signatures: one sender has up to 256 link ids
+LEAST_WORD = 8  # least number of characters of a pass phrase
 
 
 def read_key(path: str | Path) -> bytes:
-    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or by a pass phrase, whose SHA-256 it
-    then is; raises `LinkError` for a file that cannot be read, that others may read, or that holds
-    no key.
+    """Read a key of 32 bytes: raw, as 64 hexadecimal digits, or as a pass phrase, whose SHA-256
+    is the key. Raises `LinkError`: the file cannot be read, others may read it, or it holds no
+    key.
     """
     path = Path(path)
     try:
@@ -114,18 +114,18 @@ def read_key(path: str | Path) -> bytes:
 
 
 def stamp_now() -> int:
-    """Return the time as signatures have it [10 us]."""
+    """Return the current time in the unit of signatures [10 us]."""
     return int((time.time() - EPOCH) * TICKS)
 
 
 class Signed(mav.MAVLink):
-    """Packs signed messages, and parses those alone that are."""
+    """A MAVLink instance that packs signed messages, and accepts only signed ones."""
 
     def __init__(
         self, key: bytes, system: int = 0, component: int = 0, streams: dict | None = None
     ):
-        """Take a key of 32 bytes, ids of the sender, and times of the last valid signatures, of
-        another parser of the same link.
+        """Set the key of 32 bytes, the sender's ids, and ``streams``: times of the last valid
+        signatures, shared with other parsers of the link.
         """
         super().__init__(None, system, component)
         self.signing.secret_key = key
@@ -134,14 +134,14 @@ class Signed(mav.MAVLink):
         self.touch()
 
     def touch(self) -> None:
-        """Let the next signature bear the time, or one more than the last."""
+        """Set the time stamp of the next signature to the current time, if that is later."""
         self.signing.timestamp = max(self.signing.timestamp, stamp_now())
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:
-        """Return whether a signature is valid, and newer than the last valid one of its stream.
+        """Return whether a signature is valid and newer than the last valid one of its stream.
 
-        The library's own notes the time of a message before it has looked at the signature: one
-        forged message with a late time would shut the true sender out."""
+        The library's own method stores the time of a message before it checks the signature, so one
+        forged message with a late time would lock out the true sender."""
         link, units, signature = SIGNATURE.unpack(msgbuf[-SIGNATURE.size :])
         signed = bytes(msgbuf[: -len(signature)])
         good = hashlib.sha256(self.signing.secret_key + signed).digest()[: len(signature)]

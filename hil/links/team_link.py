@@ -1,10 +1,10 @@
-"""A throw that every vehicle of a team agrees on, by datagrams between their runners.
+"""Agreement of a team's vehicles on a throw, by datagrams between their runners.
 
-All runners have one clock and tick at its multiples. In each tick a runner says what it is ready
-for: nothing, a throw, or the release. The least that all were ready for ``delay`` ticks ago is
-agreed on, so that all do it in one tick. A word that comes later, or never, stands for nothing. A
-latch that has tripped cannot be taken back: its runner goes on saying so, and a member that has
-missed one word follows in the next tick."""
+All runners share a clock and tick at multiples of the period. In each tick a runner sends what it
+is ready for: nothing, a throw, or the release. The minimum of what all were ready for ``delay``
+ticks ago is agreed, so that all act in the same tick. A late or lost message counts as "nothing". A
+release cannot be taken back: its runner keeps sending it, so a member that missed one message
+follows in the next tick."""
 
 import struct
 from dataclasses import dataclass, field
@@ -15,12 +15,12 @@ from hil.links.device import check_device, chunks, open_port
 from visthrow.config.bounds import Bound, Bounded
 
 NOTHING, THROW, RELEASE = range(3)
-"""What a vehicle is ready for."""
+"""States of readiness of a vehicle."""
 
 MESSAGE = struct.Struct("<4sBq")
-"""Mark, what the sender is ready for, number of the tick."""
+"""Format of a message: mark, readiness of the sender, number of the tick."""
 MARK = b"VTC2"
-WINDOW = 25  # ticks that a word may be off: of a runner with another clock, none is taken
+WINDOW = 25  # most ticks by which a message may be off; a runner with another clock is ignored
 ROUNDING = 1e-3  # of a tick's time [ticks]
 
 
@@ -28,9 +28,9 @@ ROUNDING = 1e-3  # of a tick's time [ticks]
 class TeamLinkParams(Bounded):
     """A team whose runners agree on each throw."""
 
-    member: Annotated[int, Bound(0)]  # place of this vehicle in ``members``
-    members: tuple[str, ...]  # ADDRESS:PORT of each vehicle's runner, this one's too
-    delay: Annotated[int, Bound(1)] = 1  # age of the words that count [ticks]
+    member: Annotated[int, Bound(0)]  # index of this vehicle in ``members``
+    members: tuple[str, ...]  # ADDRESS:PORT of each vehicle's runner, including this one
+    delay: Annotated[int, Bound(1)] = 1  # age of the messages that count [ticks]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -44,7 +44,7 @@ class TeamLinkParams(Bounded):
 
 @dataclass
 class Agreement:
-    """Words of the members of a team, tick by tick."""
+    """The readiness of a team's members, by tick."""
 
     member: int  # this one
     team: int
@@ -53,17 +53,19 @@ class Agreement:
     _words: dict[int, dict[int, int]] = field(default_factory=dict)  # by tick and member
 
     def begin(self, tick: int) -> None:
-        """Begin a tick; forget what no longer counts."""
+        """Begin a tick; delete outdated messages."""
         self._now = tick
         self._words = {k: v for k, v in self._words.items() if k >= tick - self.delay}
 
     def say(self, ready: int) -> bytes:
-        """Note what this vehicle is ready for in this tick; return the message for the others."""
+        """Record what this vehicle is ready for in this tick; return the message to the others."""
         self._note(self._now, self.member, ready)
         return MESSAGE.pack(MARK, ready, self._now)
 
     def receive(self, datagram: bytes, member: int) -> bool:
-        """Note another's word and return whether it is one; the first on a tick counts."""
+        """Record another member's message; return whether it is valid. The first message for a
+        tick counts.
+        """
         if len(datagram) != MESSAGE.size:
             return False
         mark, ready, tick = MESSAGE.unpack(datagram)
@@ -74,7 +76,7 @@ class Agreement:
 
     @property
     def agreed(self) -> int:
-        """Return what all agreed on for this tick."""
+        """Readiness that all members share for this tick."""
         words = self._words.get(self._now - self.delay, {})
         return min(words.values()) if len(words) == self.team else NOTHING
 
@@ -83,7 +85,7 @@ class Agreement:
 
 
 class TeamLink:
-    """Words to and from the other members, over UDP; no other sender is listened to.
+    """The UDP link to the other members; other senders are ignored.
 
     Attributes:
         offset: of the team's clock from the runner's [s].
@@ -92,9 +94,9 @@ class TeamLink:
     def __init__(
         self, params: TeamLinkParams, period: float, offset: float = 0.0, remote: bool = False
     ):
-        """Listen at this member's address, for ticks of a period [s].
+        """Listen at this member's address; ``period``: of the ticks [s].
 
-        Raises LinkError: an address is none, is taken, or leaves this machine without ``remote``.
+        Raises LinkError: an address is invalid, in use, or on another machine without ``remote``.
         """
         devices = [check_device(f"udp:{text}", remote=remote) for text in params.members]
         self.offset = offset
@@ -105,7 +107,7 @@ class TeamLink:
         self._others = {address: k for address, k in members.items() if k != params.member}
 
     def agree(self, time: float) -> int:
-        """Read what has come; return what all agreed on for the tick at a time [s]."""
+        """Read the received messages; return what all agreed on for the tick at a time [s]."""
         self._agreement.begin(int((time + self.offset) / self._period + ROUNDING))
         for datagram in chunks(self._port, lambda sender: sender not in self._others):
             self._agreement.receive(datagram, self._others[self._port.sender])
@@ -118,5 +120,5 @@ class TeamLink:
             self._port.write(message, address)
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._port.close()

@@ -1,5 +1,5 @@
-"""What goes over links, and a run's lines, in files: written by a thread each, so that a slow disk
-delays no tick.
+"""Files of link traffic and of a run's ticks, each written by its own thread, so that a slow
+disk delays no tick.
 """
 
 import struct
@@ -14,14 +14,14 @@ from visthrow.common.errors import StorageError
 
 # files in a run's folder
 TLOG = "link.tlog"
-POSES_TLOG = "poses.tlog"  # of poses on a port of their own
+POSES_TLOG = "poses.tlog"  # of poses on a separate port
 MSP_LOG = "link.msp"
-# chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
+# most chunks that wait for a slow disk, some minutes' worth; further chunks are lost and counted
 MOST_WAITING = 100_000
 
 WRITE_EVERY = 0.1
-"""Between two looks for what is to be written [s]: woken by each chunk, the thread would take the
-core from the flying one.
+"""Period of the writing thread [s]. If each chunk woke it, it would take the core from the
+control loop.
 """
 
 HEAD = struct.Struct(
@@ -29,13 +29,13 @@ HEAD = struct.Struct(
     # of a chunk of MSP: time since 1970 [us], b"<" to the flight controller or b">" from it, number
     # of bytes
 )
-MOST_BYTES = 65535  # length of a chunk of MSP in the file; a longer one is cut
+MOST_BYTES = 65535  # longest chunk of MSP in the file; longer ones are cut
 
 
 class Writer:
-    """A file that is added to; putting never waits nor raises.
+    """A file that is appended to by a thread; :meth:`put` never waits or raises.
 
-    ``failed`` counts chunks that were not written, ``why`` the first.
+    ``failed`` counts chunks that were not written; ``why`` is the reason for the first.
     """
 
     def __init__(self, path: str | Path):
@@ -57,7 +57,7 @@ class Writer:
         self._thread.start()
 
     def put(self, data: bytes) -> None:
-        """Add bytes."""
+        """Queue bytes for writing."""
         if len(self._waiting) < MOST_WAITING:
             self._waiting.append(data)
         else:
@@ -81,7 +81,7 @@ class Writer:
                 self._waiting.clear()
 
     def close(self) -> None:
-        """Write what is left and close."""
+        """Write the remaining chunks and close the file."""
         self._over.set()
         self._thread.join()
         try:
@@ -94,13 +94,13 @@ class TlogWriter(Writer):
     """A .tlog: for each message the time [us, big-endian] and its bytes."""
 
     def write(self, message: Any, unix_time: float | None = None) -> None:
-        """Append a message, parsed or packed, of a time [s]; of now where it is left out."""
+        """Append a message, parsed or packed; ``unix_time``: its time [s], by default now."""
         stamp = int((time.time() if unix_time is None else unix_time) * 1e6)
         self.put(struct.pack(">Q", stamp) + bytes(message.get_msgbuf()))
 
 
 class LoggedPort:
-    """A port whose traffic is written down, both ways; see :data:`HEAD`."""
+    """A port whose traffic in both directions is recorded; :data:`HEAD` is the format."""
 
     def __init__(self, port: Port, path: str | Path):
         """Open the file; raises `StorageError` where it cannot be written."""

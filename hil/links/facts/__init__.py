@@ -1,9 +1,10 @@
-"""What firmwares do, by their public sources: a TOML file a firmware, a row a fact.
+"""Facts about firmwares from their public sources: one TOML file for each firmware, one row for
+each fact.
 
-A row names the value, the file and line (``at``) that it was read from, some words of that line
-(``text``), and what it means. ``version`` is the tag of the source, ``repository`` where it is
-published; a row of another version names its own. Back-ends, rehearsal vehicles, audits and pages
-read values from here alone. ``python -m bench.facts`` compares the rows with a checkout.
+A row holds the value, its file and line (``at``), some words of that line (``text``), and its
+meaning. ``version`` is the tag of the source and ``repository`` where it is published; a row from
+another version states that version. Back-ends, rehearsal vehicles, audits and pages take the values
+only from here. ``python -m bench.facts`` compares the rows with a checkout.
 """
 
 import tomllib
@@ -15,14 +16,14 @@ from typing import Any
 from visthrow.common.errors import ConfigError, suggest
 
 FOLDER = Path(__file__).parent
-HEAD = ("repository", "version")  # keys of a file that are no facts
+HEAD = ("repository", "version")  # keys of a file that are not facts
 
 
 @dataclass(frozen=True)
 class Fact:
-    """A behaviour of a firmware that a line of its source shows."""
+    """A property of a firmware, with the line of its source that shows it."""
 
-    value: Any  # SI units where it has one
+    value: Any  # in SI units, if it has a unit
     at: str  # file:line
     text: str  # some words of that line
     means: str
