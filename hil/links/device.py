@@ -1,10 +1,10 @@
-"""Device strings: which are allowed, and the ports behind them.
+"""Device strings and the ports that they open.
 
-Nothing here is ever executed or looked up elsewhere.
+A device string is only parsed: nothing is executed or resolved by name.
 
 ``udp:HOST:PORT`` listens, ``udpout:HOST:PORT`` sends first, ``tcp:HOST:PORT`` connects,
-``serial:/dev/NAME:BAUD`` opens a port. HOST is a numeric address; other than loopback ones only
-where the config says so."""
+``serial:/dev/NAME:BAUD`` opens a port. HOST is a numeric address; addresses other than loopback
+need the config's permission."""
 
 import errno
 import ipaddress
@@ -25,10 +25,9 @@ _SERIAL = re.compile(
 )
 PLUGGED = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "cu.*")  # names of serial ports in /dev
 LARGEST_DATAGRAM = 65536
-# datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
+# most datagrams, or pieces of a stream, read in one call: a flood must not delay the tick
 MOST_CHUNKS = 256
-# datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of
-# those that are ours
+# most refused datagrams that one call discards, in 5 ms: they must not block the accepted ones
 MOST_SHUT_OUT = 4096
 
 
@@ -42,8 +41,8 @@ class Device:
 
 
 def check_device(text: str, *, remote: bool = False) -> Device:
-    """Read a device string against the whitelist, loopback ones alone without ``remote``; raises
-    `LinkError` with what is allowed.
+    """Parse a device string; without ``remote`` only loopback addresses are allowed. Raises
+    `LinkError` with the allowed forms.
     """
     match = _SERIAL.fullmatch(text)
     if match:
@@ -74,37 +73,37 @@ def check_device(text: str, *, remote: bool = False) -> Device:
 
 
 class Port:
-    """A port for bytes in and out; neither call waits."""
+    """A port for bytes in both directions; no call waits."""
 
     whole = False  # whether each chunk is a whole datagram
     sender: tuple[str, int] | None = None  # of the last chunk; None on a stream, which has one peer
-    peer: tuple[str, int] | None = None  # that the device names; None where it names none
+    peer: tuple[str, int] | None = None  # address that the device names; None if it names none
     _open: Any
 
     def read(self) -> bytes | None:
-        """Return the next chunk; None where there is none."""
+        """Return the next chunk; None if there is none."""
         raise NotImplementedError
 
     def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
-        """Return whether the bytes were taken; on UDP for an address, where the device does not
-        name it.
+        """Send bytes, on UDP to an address unless the device names one; return whether the
+        system accepted them.
         """
         raise NotImplementedError
 
     def fileno(self) -> int:
-        """Return what can be waited for until there is something to read."""
+        """Return the file descriptor to wait on for input."""
         return self._open.fileno()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._open.close()
 
 
 def chunks(
     port: Port, refuses: Callable[[tuple[str, int] | None], bool] = lambda sender: False
 ) -> Iterator[bytes]:
-    """Yield what has arrived at a port, at most `MOST_CHUNKS` chunks of it; no datagram of a sender
-    that ``refuses`` returns True for.
+    """Yield at most `MOST_CHUNKS` chunks that have arrived at a port, without datagrams of
+    senders for which ``refuses`` returns True.
     """
     looked = shut_out = 0
     while looked < MOST_CHUNKS and shut_out < MOST_SHUT_OUT:
@@ -119,14 +118,14 @@ def chunks(
 
 
 def make_port_error(port: str, number: int, error: OSError, option: str = "") -> LinkError:
-    """Return the error that says why a port of this machine cannot be listened on and, where
-    another program has it, what to do.
+    """Return the error for a port of this machine that cannot be opened for listening, with advice
+    if another program uses it.
 
     Args:
         port: Its name, as ``udp:127.0.0.1:14560``.
         number: Its number.
         error: What the system said.
-        option: Option that names another port; where there is none, the port cannot be changed.
+        option: Option that selects another port; empty if the port is fixed.
     """
     if error.errno == errno.EADDRNOTAVAIL:
         return LinkError(
@@ -143,12 +142,14 @@ def make_port_error(port: str, number: int, error: OSError, option: str = "") ->
 
 
 class UdpPort(Port):
-    """A UDP socket; one that listens hears everybody, and says who sent what."""
+    """A UDP socket; a listening one receives from all senders, and ``sender`` is that of the
+    last chunk.
+    """
 
     whole = True
 
     def __init__(self, device: Device, option: str = ""):
-        """Open it; raises `LinkError` where the address is taken or not this machine's.
+        """Open the socket. Raises `LinkError`: the address is in use or not this machine's.
 
         ``option``: as of `make_port_error`.
         """
@@ -168,7 +169,7 @@ class UdpPort(Port):
     def read(self) -> bytes | None:
         try:
             data, sender = self._open.recvfrom(LARGEST_DATAGRAM)
-        except OSError:  # there is none, or the peer's port is closed: ICMP, reported here
+        except OSError:  # no data, or ICMP has reported that the peer's port is closed
             return None
         self.sender = sender[:2]
         return data
@@ -201,7 +202,7 @@ class _Stream(Port):
 
 
 class TcpPort(_Stream):
-    """A TCP connection, opened within two seconds or not at all."""
+    """A TCP connection, with a time-out of two seconds for opening it."""
 
     def __init__(self, device: Device):
         """Connect; raises `LinkError` where nobody answers."""
@@ -239,10 +240,9 @@ class SerialPort(_Stream):
 
 
 def open_port(device: Device, option: str = "") -> Port:
-    """Open the port of a checked device string; raises `LinkError` where it cannot be opened.
+    """Open the port of a checked device string. Raises `LinkError`: it cannot be opened.
 
-    ``option``: the option that names another device; it stands in the message of a port that is
-    taken."""
+    ``option``: option that selects another device, for the message if the port is in use."""
     if device.kind in ("udp", "udpout"):
         return UdpPort(device, option)
     return TcpPort(device) if device.kind == "tcp" else SerialPort(device)

@@ -1,8 +1,8 @@
-"""The MAVLink link: datagrams in, messages to whoever listens, messages out, both ways into a
-.tlog; TIMESYNC on it, both ways.
+"""The MAVLink link: it passes received messages to listeners, sends messages, records both in a
+.tlog, and exchanges TIMESYNC.
 
-Nothing here waits, and no bytes that arrive make it raise. :func:`poses_from_message` and
-:func:`attitude_target` are the boundary between MAVLink's units and orders and ours."""
+No call waits, and received bytes never make it raise. :func:`pose_from_message` and
+:func:`attitude_target` convert between MAVLink's units and conventions and ours."""
 
 import math
 import random
@@ -24,25 +24,26 @@ BODY_FRAMES = (mav.MAV_FRAME_BODY_FRD, mav.MAV_FRAME_BODY_NED)
 POSE_MESSAGES = ("ATT_POS_MOCAP", "VISION_POSITION_ESTIMATE", "ODOMETRY")
 NAN_QUATERNION = (math.nan,) * 4
 
-# type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently
-# not followed
+# type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. With further bits set, autopilots
+# silently ignore the message
 IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 OUR_SYSTEM = 245
 OUR_COMPONENT = mav.MAV_COMP_ID_ONBOARD_COMPUTER
 COMMAND_VALUES = 7  # of COMMAND_LONG
-# where system and component stand in a message's bytes
+# positions of system and component in a message's bytes
 IDS = {mav.PROTOCOL_MARKER_V1: slice(3, 5), mav.PROTOCOL_MARKER_V2: slice(5, 7)}
-MOST_PENDING = 50  # questions for a time whose answer may still come
+MOST_PENDING = 50  # most TIMESYNC requests that wait for an answer
 
 
 class Link:
     """The MAVLink peers of a port.
 
     Attributes:
-        received, sent, dropped: messages that were taken in, went, and could not be sent.
-        parser: counts what was no message. roster: who may speak.
-        sender: address of the message that listeners are called with.
-        on_pump: called with the time [s] whenever arrivals were taken in. sync:
+        received, sent, dropped: numbers of messages accepted, sent, and not sent because of an
+            error.
+        parser: counts invalid messages. roster: who may send.
+        sender: address of the message that listeners are processing.
+        on_pump: called with the time [s] after arrivals were processed. sync:
             `hil.links.mavlink_link.LinkSync`, where there is one.
     """
 
@@ -60,9 +61,9 @@ class Link:
         Args:
             port: see `hil.links.device`. system, component: our own ids; component 191 is an
                 onboard computer.
-            tlog: written both ways; closed with the link. roster: who may speak; None takes
+            tlog: records both directions; closed with the link. roster: who may send; None:
                 anybody.
-            key: that messages are signed with, and have to be; None: neither.
+            key: with which sent messages are signed and received ones must be; None: no signatures.
         """
         self.port = port
         self.roster = roster or Roster()
@@ -79,7 +80,9 @@ class Link:
         self.received = self.sent = self.dropped = 0
 
     def packer(self, system: int, component: int) -> mav.MAVLink:
-        """Return what packs messages of ids of their own for this link, signed where it is."""
+        """Return an encoder of messages with the given ids for this link, with signatures if the
+        link has a key.
+        """
         return (
             mav.MAVLink(None, system, component)
             if self._key is None
@@ -91,7 +94,7 @@ class Link:
         self._listeners.append(listener)
 
     def pump(self, clock: Callable[[], float]) -> int:
-        """Hand all that has arrived to the listeners; returns 0 where nothing has."""
+        """Pass all arrivals to the listeners; return 0 if nothing has arrived."""
         looked = 0
         refused = self.roster.refused
         for data in chunks(self.port, self.roster.shuts_out):
@@ -103,7 +106,7 @@ class Link:
         return looked + self.roster.refused - refused
 
     def _take(self, data: bytes, arrival: float) -> int:
-        """Hand on the messages in a chunk that are of our parties; returns their number."""
+        """Pass the accepted messages in a chunk to the listeners; return their number."""
         parser = self.parser
         count = 0
         errors = parser.errors
@@ -124,8 +127,8 @@ class Link:
         return count
 
     def send(self, message: Any, address: Address = None) -> bool:
-        """Send a message, to one address or to the autopilot's where it names a target, else to all
-        parties'; whether the port took it.
+        """Send a message to an address; without one, to the autopilot if the message names a
+        target, else to all parties. Return whether the port accepted it.
         """
         try:
             if isinstance(self._mav, Signed):
@@ -151,7 +154,7 @@ class Link:
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the attitude wxyz of MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN where
+    """Return the attitude wxyz for MAVLink's angles (yaw, then pitch, then roll) [rad]; NaN if
     one is not finite.
     """
     if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
@@ -161,11 +164,11 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
-    """Return a body's pose in SI units, still in MAVLink's frames: world north east down or the
-    like, quaternion wxyz.
+    """Return a body's pose in SI units, still in the sender's frames (such as north, east, down),
+    quaternion wxyz.
 
-    None for what is no ATT_POS_MOCAP, VISION_POSITION_ESTIMATE or ODOMETRY, and for an ODOMETRY in
-    another frame than LOCAL_NED or LOCAL_FRD."""
+    None for messages other than ATT_POS_MOCAP, VISION_POSITION_ESTIMATE and ODOMETRY, and for
+    ODOMETRY in a frame other than LOCAL_NED and LOCAL_FRD."""
     kind = message.get_type()
     if kind not in POSE_MESSAGES:
         return None
@@ -198,13 +201,13 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
 
 
 def _vector_or_none(vector: Vector) -> Vector | None:
-    """Return a vector; None for NaN, which MAVLink writes for a quantity that is not known."""
+    """Return a vector; None if it has a NaN, which MAVLink uses for unknown quantities."""
     return None if any(math.isnan(x) for x in vector) else vector
 
 
 def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_frd: Vector) -> Any:
-    """Return SET_ATTITUDE_TARGET at a time [s]: collective thrust, 0 to 1, body rates forward,
-    right, down [rad/s].
+    """Return SET_ATTITUDE_TARGET at a time [s] with collective thrust, 0 to 1, and body rates
+    forward, right, down [rad/s].
     """
     stamp = int(time_s * 1e3) & 0xFFFFFFFF
     return mav.MAVLink_set_attitude_target_message(
@@ -224,22 +227,21 @@ def parameter_request(target: tuple[int, int], name: str) -> Any:
 
 
 ASK_EVERY = (0.05, 0.15)
-"""Between two questions [s], drawn anew for each: a peer that works in periods of its own answers a
-question that comes at the same point of its period always with the same delay, which no shortest
-round trip would betray.
+"""Range of the random time between two requests [s]. A periodic peer answers requests at one
+phase of its period always with the same delay, which the shortest round trip would not reveal.
 """
 
 EARLY = 0.005
 LATE = 0.2
-"""A pose that seems to arrive earlier than it was measured by more than this, or later by more,
-bears another clock [s].
+"""Limits of a pose's delay: if it seems to arrive before its measurement by more than ``EARLY``,
+or after it by more than ``LATE``, its stamp is of another clock [s].
 """
 
 
 class LinkSync:
-    """Keeps the clocks of all peers of a link, by MAVLink system and address: two senders of one
-    system may have two clocks. ``foreign`` counts poses whose stamps are not of their sender's
-    TIMESYNC clock.
+    """Synchronises with the clocks of all peers of a link, by MAVLink system and address,
+    because two senders of one system may have different clocks. ``foreign`` counts poses whose
+    stamps are not of their sender's TIMESYNC clock.
     """
 
     def __init__(self, link: Link):
@@ -255,7 +257,7 @@ class LinkSync:
         link.sync = self
 
     def service(self, host_time: float) -> None:
-        """Ask where it is time; nobody is asked before anybody was heard."""
+        """Send a TIMESYNC request when it is due, but none before the first message has arrived."""
         if self._link.received and host_time - self._asked >= self._pause:
             self._asked, self._pause = host_time, self._random.uniform(*ASK_EVERY)
             stamp = TimeSync.stamp(host_time)
@@ -275,8 +277,8 @@ class LinkSync:
             peer.take(message.tc1, message.ts1, arrival)
 
     def date_pose(self, pose: Pose, system: int) -> Pose:
-        """Return a pose of the message just handed on, dated on our clock where its sender's is
-        known and the stamp is of it.
+        """Return a pose from the current message with its time of measurement on our clock, if
+        the sender's clock is known and the stamp is of that clock.
         """
         peer = self.peers.get((system, self._link.sender))
         if peer is None or peer.offset is None:

@@ -1,10 +1,10 @@
-"""Who may speak on a link: each party belongs to the ids that the config names, and to the address
-of its first valid message.
+"""Access control of a link: each party is bound to the ids in the config and to the address of its
+first valid message.
 
-A party is a body's poses or the autopilot. What comes from nobody's ids, from another address than
-its party's, or from an autopilot of another type is refused, counted, and said once a sender. On
-the ground a party that has fallen silent may come back from another address (a bridge that was
-started again); in flight none may."""
+A party is the source of a body's poses or the autopilot. Messages with unknown ids, from another
+address than their party's, or from an autopilot of another type are refused, counted, and reported
+once for each sender. On the ground a silent party may return from another address (a restarted
+bridge); in flight it may not."""
 
 import ipaddress
 from collections import Counter
@@ -18,38 +18,38 @@ from visthrow.config.bounds import Bound
 
 MavlinkId = Annotated[int, Bound(1, 255)]
 
-# takes lines for the operator, and never waits; None where nobody reads them
+# function that shows lines to the operator and never waits; None: nobody reads them
 Announce = Callable[[str], None] | None
 
 # address of a datagram's sender; None on a stream, which has one peer
 Address = tuple[str, int] | None
 
-# after which another address may take a party's place on the ground: longer than a heartbeat's
-# second [s]
+# silence after which a party may return from another address on the ground [s]: longer than the
+# heartbeat's period
 SILENT = 1.5
-# kinds of messages of all senders that are counted apart; the rest is counted together
+# most combinations of sender and kind that are counted separately; others are counted together
 MOST_KEPT = 256
-MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
-# why a message of a party is not taken that has not been heard as the one that it is to be
+MOST_SAID = 20  # most senders that are reported during a run; the summary has the others
+# reason to refuse a party's message that arrives before its identifying one
 NOT_YET = "before its first"
-# messages that a party may send beside its own: its clock, and whether it is simulated
+# messages that every party may send: its clock, and whether it is simulated
 SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
-SIMULATED = "SIMULATED"  # name of the NAMED_VALUE_INT by which a fake says that nothing real flies
+SIMULATED = "SIMULATED"  # NAMED_VALUE_INT by which a fake states that nothing real flies
 
 
 @dataclass(frozen=True)
 class Party:
-    """One that the config names."""
+    """A sender that the config expects."""
 
     name: str  # of a body, or "autopilot"
     system: int  # MAVLink id
     component: int  # MAVLink id; 0 for any
-    # messages that are its; empty: all that are no other party's
+    # its kinds of messages; empty: all that belong to no other party
     kinds: frozenset[str] = frozenset()
-    autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
+    autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must state
 
     def has(self, system: int, component: int) -> bool:
-        """Return whether ids are those of the party."""
+        """Return whether MAVLink ids belong to the party."""
         return self.system == system and self.component in (0, component)
 
 
@@ -61,10 +61,10 @@ class Traffic:
     system: int | None
     component: int | None
     kind: str
-    why: str = ""  # it was refused; empty where it was taken
+    why: str = ""  # reason of the refusal; empty if accepted
 
     def text(self) -> str:
-        """Return it in words."""
+        """Return a description."""
         ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
         return f"{self.kind}{ids} from {address_text(self.address)}" + (
             f": {self.why}" if self.why else ""
@@ -75,7 +75,7 @@ OTHER_TRAFFIC = Traffic(None, None, None, "others")
 
 
 def address_text(address: Address) -> str:
-    """Return an address in words."""
+    """Return an address as text."""
     if address is None:
         return "the link's peer"
     if not address[1]:
@@ -90,8 +90,8 @@ def autopilot_name(number: int) -> str:
 
 
 def check_allowed(senders: Iterable[str]) -> tuple[tuple[str, int | None], ...]:
-    """Read a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each; raises `LinkError` for
-    what is neither.
+    """Parse a list of allowed senders, ``ADDRESS`` or ``ADDRESS:PORT`` each. Raises `LinkError`:
+    an entry is neither.
     """
     out = []
     for text in senders:
@@ -113,15 +113,16 @@ def check_allowed(senders: Iterable[str]) -> tuple[tuple[str, int | None], ...]:
 
 
 class Roster:
-    """The parties of a link and where they are.
+    """The parties of a link, with their addresses.
 
     Attributes:
-        at: address by party. heard: when it last spoke [s]. flying: whether parties are held to
+        at: address by party. heard: time of its last message [s]. flying: whether parties must keep
             their addresses.
-        received: counts of what came. refused: messages and datagrams that were not taken.
-        moved: called with a party that came back from another address. tell: is handed each sender
-            that is refused, once.
-        simulated: whether a party has said that nothing real flies. only: address that the device
+        received: counts of traffic by kind and sender. refused: number of refused messages and
+            datagrams.
+        moved: called with a party that returned from another address. tell: called once for each
+            refused sender.
+        simulated: whether a party has stated that nothing real flies. only: address that the device
             names, or None.
     """
 
@@ -131,8 +132,8 @@ class Roster:
         allow: Iterable[str] = (),
         tell: Announce = None,
     ):
-        """Wait for all parties; without one, the first valid message of anybody says who is heard
-        and answered. ``allow``: addresses that may send at all; none: any.
+        """Start before the first message. Without parties, the sender of the first valid message
+        is the peer. ``allow``: addresses that may send at all; empty: all.
         """
         self.parties = tuple(parties)
         self._allow = set(check_allowed(allow))
@@ -147,8 +148,8 @@ class Roster:
         self._said: set[tuple] = set()
 
     def shuts_out(self, address: Address) -> bool:
-        """Return whether a datagram is not even looked into: not from the device's peer, not on the
-        list, from nobody in flight.
+        """Return whether a datagram is refused unread: its sender is not the device's peer, not
+        allowed, or unknown in flight.
         """
         if address is None:
             return False
@@ -165,7 +166,7 @@ class Roster:
         return True
 
     def refuse(self, traffic: Traffic, count: int = 1) -> None:
-        """Count what is not taken, and say who sent it."""
+        """Count refused traffic, and report its sender once."""
         self.refused += count
         self._count(traffic, count)
         who = (traffic.address, traffic.system, traffic.component, traffic.why)
@@ -180,7 +181,7 @@ class Roster:
         self.received[traffic] += count
 
     def admit(self, message: Any, address: Address, host_time: float) -> bool:
-        """Return whether a message is one of a party's; binds the party to its sender's address at
+        """Return whether a message belongs to a party; bind the party to the sender's address at
         a time [s].
         """
         kind = message.get_type()
@@ -190,7 +191,7 @@ class Roster:
         if party is None and any(
             p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties
         ):
-            # a party's, that nobody asked for
+            # a message of a party that the run does not use
             self._count(Traffic(address, system, component, kind))
             return False
         if self.parties:
@@ -198,7 +199,7 @@ class Roster:
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
         traffic = Traffic(address, system, component, kind, why or "")
-        # a message before a party's first is no stranger's
+        # a message before the identifying one is no intruder's
         if why is not None and not why.startswith(NOT_YET):
             self.refuse(traffic)
         else:
@@ -218,8 +219,8 @@ class Roster:
         return True
 
     def _party(self, kind: str, system: int, component: int, address: Address) -> Party | None:
-        """Return whose message it is by kind and ids; of a shared kind, one of theirs at this
-        address first.
+        """Return the party of a message by kind and ids; for shared kinds, preferably one at
+        this address.
         """
         ours = [party for party in self.parties if party.has(system, component)]
         if kind in SHARED:
@@ -234,7 +235,7 @@ class Roster:
     def _objection(
         self, party: Party | None, message: Any, kind: str, address: Address, host_time: float
     ) -> str | None:
-        """Return why a message is not taken, or None."""
+        """Return why a message is refused, or None."""
         if party is None:
             return f"nobody of this run, which expects {self.describe_parties()}"
         if (
@@ -254,7 +255,9 @@ class Roster:
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
     def _find_conflict(self, name: str, address: Address, host_time: float) -> str | None:
-        """Return why an address may not speak for a name that another one speaks for, or None."""
+        """Return why an address may not send for a name that is bound to another address, or
+        None.
+        """
         bound = self.at.get(name, address)
         if bound == address:
             return None
@@ -265,8 +268,8 @@ class Roster:
         return None
 
     def claim(self, name: str, address: Address, host_time: float) -> bool:
-        """Return whether an address may speak for a name at a time [s]; the first one that asks is
-        bound to it, under the rules of parties.
+        """Return whether an address may send for a name at a time [s]; the first address is
+        bound to the name, under the rules for parties.
         """
         why = self._find_conflict(name, address, host_time)
         if why is not None:
@@ -277,11 +280,11 @@ class Roster:
         return True
 
     def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:
-        """Count what a source could not take from a sender, and say it once."""
+        """Count traffic of a sender that a source could not use, and report it once."""
         self.refuse(Traffic(address, None, None, kind, why), count)
 
     def describe_parties(self) -> str:
-        """Return the parties in words."""
+        """Return a text that lists the parties."""
         texts = []
         for p in self.parties:
             what = "/".join(sorted(p.kinds)) if p.kinds else "all"
@@ -290,15 +293,15 @@ class Roster:
         return ", ".join(texts) or "anybody"
 
     def addresses(self, message: Any) -> tuple[Address, ...]:
-        """Return where a message of ours goes: what names a target to the autopilot, the rest to
-        all.
+        """Return the addresses that a message is sent to: the autopilot's if it names a target,
+        else all.
         """
         if hasattr(message, "target_system") and "autopilot" in self.at:
             return (self.at["autopilot"],)
         return tuple(dict.fromkeys(self.at.values()))
 
     def summary(self) -> dict[str, Any]:
-        """Return who was heard from where, and what was refused, most first."""
+        """Return each party's address and the refused traffic, most frequent first."""
         refused = [
             {"count": count, "what": traffic.text()}
             for traffic, count in self.received.most_common()

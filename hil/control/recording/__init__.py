@@ -1,1 +1,1 @@
-"""Recordings of a run: what is written while it flies, and what is made of it afterwards."""
+"""Recordings of a run, and the logs, reports and views made from them."""

@@ -1,4 +1,4 @@
-"""Flight logs of a run, in the form of simulated ones, by playing its folder back.
+"""Flight logs of a run, in the format of simulated ones, made by playing its folder back.
 
 Times are those of the measurements, on the runner's clock: a source's stamps, shifted by the median
 difference from the arrivals less the transit (by TIMESYNC, or the config's delay) over neighbouring
@@ -25,16 +25,17 @@ from visthrow import config
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
-# a throw's log begins this long before it, and ends this long after its recovery [s]
+# time in a throw's log before the throw and after its recovery [s]
 LEAD_TIME = 2.0
 TRAIL_TIME = 0.5
 LEAST_STEP = 1e-6  # between two samples of a channel [s]: simultaneous poses keep their order
 SPUN_UP = math.log(100.0)
-"""Time in which standing rotors reach the commanded speed to 1 % [time constants of a motor], after
-an autopilot begins to follow; before it commands are not valid.
+"""Time in which rotors at rest reach the commanded speed to 1 %, after an autopilot begins to
+follow [time constants of a motor]; until then commands are marked invalid.
 """
 
-# poses on either side of which a clock's offset is the median: jitter goes, drift stays
+# poses on either side over which the median of a clock's offset is taken: it removes jitter and
+# keeps drift
 HALF_WINDOW = 25
 THROW_STATES = (State.THROW, State.RECOVER, State.ABORT)
 
@@ -77,12 +78,12 @@ class PlayedRun:
 
 
 def date_by_arrival(sample: Sample, params: HilParams) -> float:
-    """Return the time of a pose's measurement by its arrival alone [s]."""
+    """Return the time of a pose's measurement [s], from its arrival and transit alone."""
     return sample.pose.arrival - sample.pose.transit(params.delay.source)
 
 
 def read(folder: str | Path) -> PlayedRun:
-    """Play a run back; raises `RunError` for what is not the folder of a run, or a damaged one."""
+    """Play a run back. Raises `RunError`: not the folder of a run, or a damaged one."""
     folder = Path(folder)
     params, policy, lines = load_run(folder)
     if not lines:
@@ -96,7 +97,7 @@ def read(folder: str | Path) -> PlayedRun:
 
 
 def _read_json(path: Path) -> dict[str, Any]:
-    """Return a file's content; empty where the run was killed before it was written."""
+    """Return a file's content; empty if the run was killed before it was written."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -107,14 +108,14 @@ class TickLogger:
     """Adds ticks to a flight log."""
 
     def __init__(self, playback: Playback, provenance: dict[str, Any], start: float):
-        """Start an empty log with what is known from a run's beginning on; ``start`` [s] is the
-        zero of its pictures.
+        """Start an empty log with the metadata known at a run's start; ``start`` [s] is the zero
+        of its pictures.
         """
         self.params = playback.params
         self.recorder = FlightRecorder(_meta_of(playback, provenance, start))
         self._declare()
-        self._times: dict[str, float] = {}  # of each body's last sample [s]
-        self._vehicle: Pose | None = None  # last pose: where the rope hangs
+        self._times: dict[str, float] = {}  # time of each body's last sample [s]
+        self._vehicle: Pose | None = None  # last pose, for the rope's mount
         self._follow_time: float | None = None  # when the autopilot began to follow [s]
         contract = playback.runner.pilot.policy.contract
         self._spin_up = SPUN_UP * contract["vehicle"]["motor"]["time_constant"]
@@ -187,7 +188,7 @@ class TickLogger:
             self._note_estimated(vel_w=pose.vel, rate_b=pose.rate)
 
     def _note_estimated(self, **source_values: Any) -> None:
-        """Note in the metadata the channels that the source does not measure."""
+        """List the channels that the source does not measure in the metadata."""
         estimated = self.recorder.meta.setdefault("estimated", [])
         for name, value in source_values.items():
             if value is None and name not in estimated:
@@ -195,7 +196,7 @@ class TickLogger:
 
 
 def _meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
-    """Return the metadata that are known from a run's beginning on."""
+    """Return the metadata known at a run's start."""
     params = playback.params
     policy = playback.runner.pilot.policy
     goal_w = playback.runner.estimator.goal_w or params.goal_w
@@ -225,8 +226,8 @@ def events(ticks: list[Tick]) -> list[list]:
 
 
 def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -> FlightLog:
-    """Return the log of the ticks from ``first`` to ``last``, both included; of a throw by its
-    number.
+    """Return the log of the ticks from ``first`` to ``last``, both included; ``throw``: index of
+    the throw in them, if any.
     """
     ticks = played.ticks[first : last + 1]
     runner = played.playback.runner
@@ -268,7 +269,7 @@ def _add_result(
         "recovery": recovery.line["time"],
         "end": ticks[-1].line["time"],
     }
-    # An abort after the landing does not spoil the throw.
+    # An abort after the landing does not invalidate the throw.
     landed = np.inf if landing is None else landing.time
     aborts = (
         tick.decision.reason
@@ -300,7 +301,7 @@ def _add_result(
 
 
 def throws(played: PlayedRun) -> list[FlightLog]:
-    """Return a log a throw."""
+    """Return one log for each throw."""
     logs = []
     begin = 0
     period = played.playback.runner.pilot.period

@@ -1,5 +1,5 @@
-"""Where the time of a tick goes: percentiles and a histogram a stage, in memory that does not grow
-with the run.
+"""Times of each stage of a tick, as percentiles and histograms in memory that does not grow with
+the run.
 """
 
 import math
@@ -23,20 +23,20 @@ STAGES = {
     "total": "from the look for messages to the command's bytes out",
     "ack": "from the release command to its answer",
 }
-"""Stage -> what it is, in the order of the report."""
+"""Stage -> description, in the order of the report."""
 OF_CLOCK = ("transport", "arrival", "late", "ack")
-"""Stages between two readings of the run's clock, which ``--speed`` slows; the others are taken in
-real time.
+"""Stages measured by the run's clock, which ``--speed`` slows; the others are measured in real
+time.
 """
 
 SHORTEST = 1e-6  # lower edge of the first bin [s]
 GROWTH = 1.01  # ratio of two edges: within 1 %
 BINS = 1640  # up to 12 s
-CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
+CLOCK_STEP = 0.3  # change of the offset of a source's clock that counts as a step [s]
 
 
 class Stage:
-    """Times of one stage: counts in bins that grow by one per cent, and the largest one exactly."""
+    """A histogram of one stage's times in bins that grow by 1 %, with the exact maximum."""
 
     def __init__(self) -> None:
         self.counts = np.zeros(BINS, dtype=np.int64)
@@ -49,14 +49,14 @@ class Stage:
         self.most = max(self.most, seconds)
 
     def percentile(self, share: float) -> float:
-        """Return the time [s] below which a share of all lie, 0 to 1; to one per cent, and never
-        above the largest.
+        """Return the time [s] below which a share of all times lies, 0 to 1; accurate to 1 %, at
+        most the maximum.
         """
         reached = np.searchsorted(np.cumsum(self.counts), share * self.counts.sum())
         return min(SHORTEST * GROWTH ** (float(reached) + 0.5), self.most)
 
     def summary(self) -> dict[str, float]:
-        """Return p50, p95, p99 and max [ms] and the count; empty where nothing was counted."""
+        """Return p50, p95, p99 and max [ms] and the count; empty without times."""
         count = int(self.counts.sum())
         if not count:
             return {}
@@ -81,8 +81,8 @@ class Stages:
             self.stages[name].add(seconds)
 
     def poses(self, poses: list[Pose], time: float) -> dict[str, float]:
-        """Return times of the vehicle's poses that have come for a tick at a time [s]; transport is
-        counted a pose.
+        """Return the time from the newest arrival of a vehicle's pose to a tick at a time [s];
+        count the transport time of each pose.
         """
         newest = None
         for pose in poses:
@@ -107,7 +107,7 @@ class Stages:
 
 
 def describe_clock(speed: float) -> str:
-    """Return whose milliseconds they are, where the run's clock is not real time; else nothing."""
+    """Return a note on the stages measured by the run's clock; empty if that is real time."""
     return (
         ""
         if speed == 1.0
@@ -116,8 +116,8 @@ def describe_clock(speed: float) -> str:
 
 
 def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]:
-    """Return lines of a report, a stage a line, of :meth:`Stages.summary` and the speed of the
-    run's clock.
+    """Return the lines of a report, one for each stage, from :meth:`Stages.summary` and the
+    speed of the run's clock.
     """
     lines = [f"{'stage':11}     p50     p95     p99     max [ms]{describe_clock(speed)}"]
     for name, values in latency.items():
@@ -130,8 +130,8 @@ def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]
 
 
 def draw(path: str | Path, stages: Stages, title: str) -> None:
-    """Draw for each stage how many of its times are longer than a time, as a PNG file; raises
-    `StorageError` where it cannot be written.
+    """Draw the share of each stage's times that exceed a given time, as a PNG file. Raises
+    `StorageError`: it cannot be written.
     """
     from visthrow.common.storage import atomic_write
     from visthrow.view import style

@@ -1,7 +1,6 @@
-"""A recorded run, run again tick by tick: what the runner decided and what it took for true.
+"""Playback of a recorded run, tick by tick, with the runner's decisions and estimates.
 
-The replay, the flight logs and the viewer are all made of this, so that they show what was flown
-and nothing else."""
+The replay, the flight logs and the viewer all use it, so that they show exactly what was flown."""
 
 import argparse
 import json
@@ -24,24 +23,24 @@ from visthrow.onboard.policy import Policy
 
 @dataclass
 class Sample:
-    """A pose that the gate let through, in our frames, with what was estimated from it."""
+    """An accepted pose in our frames, with the velocities estimated from it."""
 
     body: str
-    pose: Pose  # stamp on the source's clock, freed of its steps
+    pose: Pose  # stamp on the source's clock, with its steps removed
     vel_w: Vector  # [m/s]
     rate_b: Vector  # [rad/s]
-    # of the measurement on the runner's clock [s], once it was worked out from the whole run
+    # of the measurement on the runner's clock [s]; None until it is computed from the whole run
     time: float | None = None
 
 
 @dataclass
 class Tick:
-    """One tick of a run: as recorded, as decided, and the poses that were taken in it."""
+    """One tick of a run: its recorded line, its decision, and the poses accepted in it."""
 
     line: dict[str, Any]
     decision: TickRecord
     samples: list[Sample]
-    ages: dict[str, float]  # of the poses' content by body [s]
+    ages: dict[str, float]  # of each body's last pose [s]
     attached: bool  # whether the payload hangs on the vehicle: until the release's lag is over
     goal_w: Vector | None
 
@@ -63,7 +62,7 @@ class Playback:
         self._samples = []
         runner = self.runner
         time = line["time"]
-        detection = line.get("detection", line.get("seen"))  # runs of before call it "seen"
+        detection = line.get("detection", line.get("seen"))  # older runs call it "seen"
         if detection is not None:
             runner.estimator.take_detections([Detection.of(detection)])
         calibration = line.get("calibration")
@@ -89,13 +88,13 @@ class Playback:
         )
 
 
-# what a replay must give again, bit for bit
+# values that a replay must reproduce bit for bit
 COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
 
 
 def replay(folder: str | Path) -> dict[str, Any]:
-    """Run the recorded poses, statuses and words of a run through the runner again; raises
-    `RunError` for a folder that is none.
+    """Run the recorded poses, statuses and operator commands through the runner again. Raises
+    `RunError`: not the folder of a run.
 
     Returns the number of ticks and actions compared, the differences (tick, name, recorded value,
     value now), and what is missing of the recording, or None; ``story``: where it went wrong, in a
@@ -124,7 +123,7 @@ def replay(folder: str | Path) -> dict[str, Any]:
 
 
 def _describe_missing(folder: str | Path, ticks: int) -> str | None:
-    """Return what is missing of a recording, in words."""
+    """Return a text on what is missing in a recording; None if it is complete."""
     try:
         flown = json.loads((Path(folder) / SUMMARY).read_text(encoding="utf-8"))["ticks"]
     except OSError:
@@ -138,8 +137,8 @@ def _describe_missing(folder: str | Path, ticks: int) -> str | None:
 
 
 def sentence(flown: list[tuple[TickRecord, BodyState | None]], cut: str | None) -> str:
-    """Return where a run went wrong, by its decisions, the vehicle as it was seen at each, and what
-    is missing of the recording.
+    """Return a sentence on where a run went wrong, from its decisions, the vehicle's state at
+    each, and what is missing in the recording.
     """
     if not flown:
         return "Whether it went wrong is not known: no tick is recorded."
@@ -166,8 +165,8 @@ def sentence(flown: list[tuple[TickRecord, BodyState | None]], cut: str | None) 
 
 
 def compare_run(args: argparse.Namespace) -> int:
-    """Run a recorded run again, and compare; 1 where anything differs or the recording was cut,
-    else 0: ``visthrow hil replay``.
+    """Replay a recorded run and compare (``visthrow hil replay``); return 1 if anything differs
+    or the recording is incomplete, else 0.
     """
     with open_folder(args.folder) as folder:
         comparison = replay(folder)

@@ -1,9 +1,9 @@
-"""One folder a run: config, policy, every tick with its raw poses, the link's .tlog; and what is
-made of it afterwards.
+"""The folder of a run: config, policy, every tick with its raw poses, the link's .tlog, and the
+results made from them.
 
-``ticks.jsonl`` holds a tick a line and survives a kill but for a tenth of a second; floats are
-written so that they read back to the same bits. Lines are written by a thread of their own, so that
-a slow disk delays no tick."""
+``ticks.jsonl`` holds one tick on each line. If the run is killed, at most the last tenth of a
+second is lost. Floats are written so that they are read back bit for bit. A separate thread writes
+the lines, so that a slow disk delays no tick."""
 
 import hashlib
 import json
@@ -32,8 +32,8 @@ from visthrow.onboard.policy import Policy, find_policy
 POLICY = "policy.npz"
 CONFIG = "config.toml"
 TICKS = "ticks.jsonl"
-BASE = "hil/dry_run.toml"  # under the config of a run that is read again
-FORMER_POSES = "poses.jsonl"  # of runs that were recorded with the poses apart
+BASE = "hil/dry_run.toml"  # base of the config of a recorded run
+FORMER_POSES = "poses.jsonl"  # of older runs, with the poses in a separate file
 SUMMARY = "summary.json"
 PROVENANCE = "provenance.json"
 
@@ -43,10 +43,10 @@ EXPECTED = f"expected {CONFIG}, {POLICY} and {TICKS} in it"
 
 @contextmanager
 def begin_folder(folder: Path) -> Iterator[None]:
-    """Keep a new folder only where the run that is to write it begins; raises `StorageError` for
-    one that holds a run already.
+    """Remove a new folder again if the run cannot start. Raises `StorageError`: the folder already
+    holds a run.
 
-    The links write theirs before there is a recorder.
+    Links write their files before a recorder exists.
     """
     provenance.check_free(folder)
     new = not folder.exists()
@@ -62,8 +62,8 @@ class RunRecorder:
     """Writes a run's folder."""
 
     def __init__(self, folder: str | Path, params: HilParams):
-        """Make the folder with config, policy and provenance; raises `StorageError` where it holds
-        a run already, or cannot be written.
+        """Create the folder with config, policy and provenance. Raises `StorageError`: it
+        already holds a run, or cannot be written.
         """
         self.folder = Path(folder)
         source = find_policy(params.policy)
@@ -79,7 +79,7 @@ class RunRecorder:
 
     @property
     def failed(self) -> str | None:
-        """Return the reason why something could not be written, or None."""
+        """Reason why something could not be written, or None."""
         return self._writer.why
 
     def tick(
@@ -94,7 +94,7 @@ class RunRecorder:
     ) -> None:
         """Record one tick; never raises and never waits.
 
-        Once something was lost, nothing more is written.
+        Once a line was lost, no more are written.
         """
         if self.failed is not None:
             return
@@ -110,17 +110,17 @@ class RunRecorder:
         self._writer.put(json.dumps(line).encode() + b"\n")
 
     def close(self, summary: dict[str, Any]) -> None:
-        """Write what is left and the summary; raises `StorageError` where the disk is full, when
-        the run itself is over.
+        """Write the remaining lines and the summary. Raises `StorageError`: the disk is full;
+        the run itself is over then.
         """
         self._writer.close()
         write_json(self.folder / SUMMARY, {**summary, "recording_failed": self.failed})
 
 
 def lines(path: Path) -> Iterator[Any]:
-    """Yield a file's values, a line each; a last line that was cut short is left out.
+    """Yield the value of each line of a file; an incomplete last line is left out.
 
-    Raises `RunError` for no file, or a damaged line.
+    Raises `RunError`: no such file, or a damaged line.
     """
     try:
         rows = path.read_text(encoding="utf-8").split("\n")
@@ -137,7 +137,7 @@ def lines(path: Path) -> Iterator[Any]:
 
 
 def restore_poses(line: dict[str, Any]) -> dict[str, Any]:
-    """Return a line of a tick with its raw poses as such."""
+    """Return the line of a tick with its raw poses as `Pose` objects."""
     poses = []
     for stamp, arrival, body, *values in line["poses"]:
         pos, quat, vel, rate = (None if v is None else tuple(v) for v in values[:4])
@@ -146,7 +146,7 @@ def restore_poses(line: dict[str, Any]) -> dict[str, Any]:
 
 
 def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
-    """Raise `RunError` for what is not the folder of a run, with what was expected in it."""
+    """Raise `RunError` unless a folder is that of a run; the message lists the expected files."""
     if not is_run(folder, parts):
         raise RunError(f"{folder}: not the folder of a run; {EXPECTED}")
 
@@ -157,9 +157,9 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
 
 
 def _replayable(path: Path) -> dict[str, Any]:
-    """Return config of a run without what only reads the recording's source: its poses are here,
-    and its form has changed before. Keys that are newer than the run have their shipped values; a
-    run from before the aim holds no release back, one from before the probe commands none.
+    """Return the config of a run without the keys that only describe the format of its source,
+    which a replay does not read. Keys newer than the run get their shipped values, except that a
+    run without `aim` refuses no release, and a run without `probe` commands no doublets.
     """
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -181,9 +181,7 @@ def _replayable(path: Path) -> dict[str, Any]:
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:
-    """Return config, policy and ticks of a run; raises `RunError` for what is no run, or a
-    damaged one.
-    """
+    """Return config, policy and ticks of a run. Raises `RunError`: not a run, or a damaged one."""
     folder = Path(folder)
     require_run(folder)
     setup = load_setup(folder)
@@ -193,7 +191,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
             poses: dict[int, list] = {}
             for number, *row in lines(folder / FORMER_POSES):
                 poses.setdefault(number, []).append(row)
-            # killed: the two files may end at different ticks, with half of its poses
+            # After a kill the two files may end at different ticks.
             if not (folder / SUMMARY).is_file():
                 ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
             ticks = [line | {"poses": poses.get(line["n"], [])} for line in ticks]
@@ -208,18 +206,18 @@ def load_setup(folder: Path) -> tuple[HilParams, Policy]:
     return params, Policy.load(folder / POLICY)
 
 
-# files of a bundle, beside the links' own records
+# files of a bundle, beside the links' records
 PARTS = (CONFIG, POLICY, TICKS, FORMER_POSES, SUMMARY, PROVENANCE)
 
 RECORDS = ("*.tlog", "*.msp")
 
 ENDING = ".zip"
-MOST_BYTES = 2 << 30  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
+MOST_BYTES = 2 << 30  # most bytes that a bundle may unpack to, ten times a run of an hour
 
 
 def pack(folder: str | Path) -> Path:
-    """Write the bundle of a run beside its folder and return its path; raises `RunError` where that
-    cannot be.
+    """Write the bundle of a run beside its folder and return its path. Raises `RunError`: it
+    cannot be written.
     """
     folder = Path(folder).resolve()
     require_run(folder)
@@ -240,8 +238,8 @@ def pack(folder: str | Path) -> Path:
 
 @contextmanager
 def open_folder(path: str | Path) -> Iterator[Path]:
-    """Yield the folder of a run: the one that is named, or a bundle's while it is looked at; raises
-    `RunError` for what is no bundle.
+    """Yield the folder of a run: the given one, or a temporary one with a bundle's files. Raises
+    `RunError`: the file is not a bundle.
     """
     path = Path(path)
     if path.is_dir() or not path.exists():
@@ -267,7 +265,7 @@ def open_folder(path: str | Path) -> Iterator[Path]:
             zlib.error,
             RuntimeError,
             OSError,
-        ) as error:  # RuntimeError: locked by a password, an unknown method
+        ) as error:  # RuntimeError: password or unknown compression
             raise RunError(
                 f"{path}: {error}; expected a folder of a run, or the bundle of one"
             ) from error

@@ -1,6 +1,4 @@
-"""What is made of a run's folder when the run is over: flight logs, pictures, the report of its
-times.
-"""
+"""Results made from a run's folder when the run is over: flight logs, pictures and the report."""
 
 import importlib.util
 from pathlib import Path
@@ -17,7 +15,7 @@ PICTURE_PACKAGES = ("matplotlib", "cv2")  # of the extra pictures
 
 
 def summary_text(summary: dict[str, Any], folder: Path) -> str:
-    """Return a run in a few lines."""
+    """Return a summary of a run in a few lines."""
     lines = [
         f"{'ABORTED' if summary['aborted'] else 'ended in ' + summary['state']}:"
         f" {summary['reason']}"
@@ -66,13 +64,13 @@ def summary_text(summary: dict[str, Any], folder: Path) -> str:
 
 
 def throw_path(folder: Path, number: int, ending: str) -> Path:
-    """Return the file of a throw, counted from 1."""
+    """Return the path of a throw's file; throws are counted from 1."""
     return folder / f"throw-{number:02d}{ending}"
 
 
 def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0) -> list[str]:
-    """Write latency picture, and a flight log and picture a throw, or one log of all; returns lines
-    that say what was written.
+    """Write the latency picture, and a flight log and picture for each throw, or one log of the
+    whole run; return lines that list the files.
     """
     from visthrow.view import strip
 

@@ -1,7 +1,7 @@
-"""A run in the rerun viewer: live, or from its folder.
+"""View of a run in the rerun viewer, live or from its folder.
 
-The live view reads the folder that the run writes, in a process of its own: the flying process does
-nothing for it that it would not do without it. Where the viewer falls behind, ticks are left out.
+The live view reads the run's folder in a separate process and adds no work to the flying one. If
+the viewer falls behind, ticks are left out.
 """
 
 import argparse
@@ -35,18 +35,18 @@ from hil.errors import RunError
 from hil.poses.pose import PAYLOAD, VEHICLE
 
 ENDINGS = (".rrd", ".mcap")  # of recordings: for rerun, for Foxglove
-POLL_INTERVAL = 0.1  # between two looks at the folder [s]
-MOST_SHOWN = 100  # ticks sent at a time; of more, where the viewer fell behind, the last ones
-TRAIL = 300  # poses whose places stay drawn: three seconds at 100 Hz
+POLL_INTERVAL = 0.1  # between two reads of the folder [s]
+MOST_SHOWN = 100  # most ticks sent at a time: if the viewer falls behind, only the last ones
+TRAIL = 300  # poses in a drawn trail: three seconds at 100 Hz
 
 BODY_CHANNELS = {VEHICLE: "pos_w", PAYLOAD: "payload_pos_w"}
 
 
 class Show:
-    """Sends ticks to a stream of rerun."""
+    """Sends ticks to a rerun stream."""
 
     def __init__(self, stream: Any, playback: Playback, provenance: dict[str, Any], start: float):
-        """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
+        """Send the static parts; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
         self._stream = stream
@@ -60,7 +60,7 @@ class Show:
         )
 
     def take(self, ticks: list[Tick]) -> None:
-        """Send some ticks, in order."""
+        """Send ticks in their order."""
         for tick in ticks:
             self._samples.add(tick)
             for sample in tick.samples:
@@ -80,7 +80,7 @@ class Show:
 
 
 def sizes(pilot: Any) -> SimpleNamespace:
-    """Return what `visthrow.view.rerun_view` draws by, from the policy's contract."""
+    """Return the sizes that `visthrow.view.rerun_view` draws, from the policy's contract."""
     contract = pilot.policy.contract
     rotors = SimpleNamespace(**contract["vehicle"]["rotors"])
     rope = SimpleNamespace(payload_radius=contract["rope"]["payload_radius"])
@@ -90,8 +90,8 @@ def sizes(pilot: Any) -> SimpleNamespace:
 
 
 def tail(path: Path) -> Generator[list[Any], None, None]:
-    """Yield, each time, the values of the lines that were completed since the last one; the file
-    may not be there yet.
+    """Yield at each step the values of the lines completed since the last step; the file may not
+    exist yet.
     """
     while not path.is_file():
         yield []
@@ -103,8 +103,8 @@ def tail(path: Path) -> Generator[list[Any], None, None]:
 
 
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
-    """Send a run to a stream of rerun while it is written, until it is over; returns the number of
-    ticks that were left out.
+    """Send a run to a rerun stream while it is written, until it is over; return the number of
+    ticks left out.
     """
     folder = Path(folder)
     require_run(folder, (CONFIG, POLICY, PROVENANCE))
@@ -133,8 +133,8 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
 
 
 def write(folder: str | Path, path: str | Path) -> None:
-    """Write a whole run as a ``.rrd`` or ``.mcap`` file; errors as of :func:`read`, and where the
-    place cannot be written, or a package is missing.
+    """Write a whole run as a ``.rrd`` or ``.mcap`` file. Raises the errors of :func:`read`, and
+    one if the file cannot be written or a package is missing.
     """
     from visthrow.view import mcap_view, rerun_view
 
@@ -156,14 +156,14 @@ def write(folder: str | Path, path: str | Path) -> None:
 
 
 def start_viewer(folder: Path) -> subprocess.Popen:
-    """Start the live view of a run in a process of its own, at the lowest priority."""
+    """Start the live view of a run in a separate process at the lowest priority."""
     command = [sys.executable, "-m", "visthrow.cli", "hil", "view", str(folder), "--live"]
     lowest = (lambda: os.nice(19)) if hasattr(os, "nice") else None
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=lowest)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the live view, or write files: ``visthrow hil view``."""
+    """Serve the live view or write the files of ``visthrow hil view``."""
     from hil.control.recording.run_report import finish
 
     folder = Path(args.folder)

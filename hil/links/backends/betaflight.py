@@ -256,9 +256,7 @@ class Betaflight(OnPort):
         if self._raised and self._followed_at is None:
             self._followed_at = host_time
         self._poll(host_time)
-        if (
-            self._boxes and self._heard > 0.0
-        ):  # the armed state is known: nothing is written while armed
+        if self._boxes and self._heard > 0.0:  # nothing is written while armed
             self.audit.service(host_time)
         self._serve_release(host_time)
         ours = self.params.arm_channel and not self._taken and not self._over
