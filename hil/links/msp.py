@@ -99,6 +99,6 @@ class FrameParser:
                     del buffer[: end + 1]
                     continue
             self.errors += 1
-            del buffer[:1]  # search on right after this start
+            del buffer[:1]  # look for the next start after this byte
         buffer.clear()
         return frames
