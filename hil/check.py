@@ -1,5 +1,5 @@
-"""``visthrow hil check``: the poses that come and the autopilot, a hand-carry, the
-hover of a run.
+"""``visthrow hil check``: checks of the poses and the autopilot, of a hand-carry, or of a run's
+hover.
 """
 
 import argparse
@@ -31,14 +31,14 @@ from visthrow.onboard.policy import Policy, find_policy
 
 CALM = 0.15  # speed below which a hover counts as steady [m/s]
 LIFTED = 0.3  # height above which a vehicle counts as flying [m]
-SETTLING = 50  # ticks at the beginning of a hover that are left out: a second
+SETTLING = 50  # ticks at the start of a hover that are left out: a second
 FOR_EVER = 1e9  # [s]
-LISTEN = 5.0  # how long poses are looked at, where nothing else is said [s]
-CARRY = 180.0  # how long a vehicle is carried about, likewise [s]
+LISTEN = 5.0  # default duration of the check of poses [s]
+CARRY = 180.0  # default duration of a hand-carry [s]
 
 
 def check(args: argparse.Namespace) -> int:
-    """Do the check that was asked for."""
+    """Do the requested check."""
     if args.hand_carry:
         return _hand_carry(args)
     if args.hover_of is None:
@@ -50,7 +50,7 @@ def check(args: argparse.Namespace) -> int:
 
 @contextmanager
 def _open_all(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock]]:
-    """Source, the autopilot's link, and the clock."""
+    """Open the source, the autopilot's link and the clock."""
     with tempfile.TemporaryDirectory() as folder:
         opened = open_source(params, Path(folder), MonotonicClock(args.speed), key_of(args))
         try:
@@ -75,9 +75,9 @@ def _hand_carry(args: argparse.Namespace) -> int:
 
 
 def _listen(args: argparse.Namespace) -> int:
-    """Look at poses and autopilot for a while, and command nothing.
+    """Check poses and autopilot for a while, without commands.
 
-    The runner that would fly looks on, and stays before its take-over.
+    The runner that would fly processes them, but never takes the vehicle over.
     """
     params = params_of(args)
     waiting = dataclasses.replace(params.states, idle=FOR_EVER, check=FOR_EVER, check_hold=FOR_EVER)
@@ -127,8 +127,8 @@ def _listen(args: argparse.Namespace) -> int:
 
 
 def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
-    """Return which messages of those that are heard are no poses, and why; a few are none of note,
-    as of a position before the first attitude.
+    """Return texts on messages of known senders that were not accepted as poses, and why. A few
+    do not count, such as a position before the first attitude.
     """
     return [
         f"{count} {entry.text()}"
@@ -156,8 +156,8 @@ def _body_line(name: str, track: Track, time: float, seconds: float, stamped: bo
 
 
 def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
-    """Return who was heard on a link with which ids; all of it where somebody expected was not,
-    else what was refused.
+    """Return lines on a link's traffic: all of it if an expected party is silent, else the
+    refused part.
     """
     silent = [party.name for party in roster.parties if party.name not in roster.at]
     lines = (
@@ -174,24 +174,24 @@ def _link_lines(roster: Roster, params: HilParams, seconds: float) -> list[str]:
 
 
 class AutopilotCheck:
-    """Listens to an autopilot without commanding it: its parameters, and the share of thrust that
+    """A check of an autopilot without commands: of its parameters, and of the thrust share that
     it reports while the vehicle hovers.
     """
 
     def __init__(self, params: Any, backend: Any):
-        """Begin with nothing heard of the back-end; a dry run has no autopilot."""
+        """Start before the first message; a dry run has no autopilot."""
         self.backend = backend
         vehicle = params.vehicle
         self.meter = None if vehicle is None else HoverMeter(vehicle.thrust)
 
     def status(self, time: float) -> Status:
-        """Return what the runner is to know of it at a time [s]; what the audit found is said by
-        :meth:`results`.
+        """Return the status for the runner at a time [s], without the audit's fault, which
+        :meth:`results` reports.
         """
         return dataclasses.replace(self.backend.status(time), fault=None)
 
     def tick(self, time: float, runner: Any) -> None:
-        """Listen; the runner knows whether the vehicle hovers."""
+        """Process messages; ``runner``: its track shows whether the vehicle hovers."""
         self.backend.service(time)
         track = runner.tracks[VEHICLE]
         state = track.state(time)
@@ -205,7 +205,7 @@ class AutopilotCheck:
         self.backend.share = None  # each report counts once
 
     def results(self, time: float, mass: float) -> list[tuple[bool, str]]:
-        """Return what was found with a mass [kg] that hovers: whether it is good, and in words."""
+        """Return the results for a hovering mass [kg]: whether each is good, and its text."""
         if self.meter is None:
             return []
         audit = self.backend.audit
@@ -221,8 +221,8 @@ class AutopilotCheck:
 
 
 def hover_of_run(folder: str | Path) -> tuple[bool, str]:
-    """Return whether a run's hover took the weight, by what was commanded before its throws, and in
-    words; raises `RunError`.
+    """Return whether the thrust commanded in a run's hover before its throws matches the weight,
+    and a text. Raises `RunError`: not a run with an autopilot, or too little hover.
     """
     folder = Path(folder)
     require_run(folder)

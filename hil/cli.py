@@ -1,4 +1,4 @@
-"""``visthrow hil``: poses of a motion-capture system in, commands of a trained policy out.
+"""``visthrow hil``: flies a trained policy on poses of a motion-capture system.
 
 Each action is imported when chosen.
 """
@@ -19,5 +19,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what was asked."""
+    """Run the chosen action."""
     return run_command(ACTIONS, args.action, args)

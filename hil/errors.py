@@ -1,4 +1,4 @@
-"""Errors of the onboard side that a user can cause and mend."""
+"""Errors of the onboard side that a user can cause and correct."""
 
 from visthrow.common.errors import ConfigError, VisthrowError
 

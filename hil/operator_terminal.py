@@ -1,5 +1,5 @@
-"""The operator at the terminal: words typed, signals that ask the process to end, and what is said;
-none of it ever waits.
+"""The operator's terminal: typed commands, signals that end the process, and output. No call
+ever waits.
 """
 
 import contextlib
@@ -26,24 +26,24 @@ ENDING = _signals(
 )
 """Signals that would end the process and can be caught:
 
-Ctrl-C; systemd, ``timeout`` and a shutdown; a dropped ssh or a closed terminal; and those that
-nobody means.
+They come from Ctrl-C; from systemd, ``timeout`` and a shutdown; from a lost ssh connection or a
+closed terminal; or are sent by mistake.
 """
 
 PAUSING = _signals("SIGTSTP SIGTTIN SIGTTOU")
-"""Signals that would stop the process in mid flight:
+"""Signals that would stop the process in flight:
 
-Ctrl-Z, and a terminal that belongs to another job.
+from Ctrl-Z, or because the terminal belongs to another job.
 """
 
-MOST_UNSAID = 1000  # lines that wait for a terminal that takes none; those beyond are lost
-LAST_WORDS = 2.0  # that the end of a run waits for its lines to be taken [s]
-MOST_TYPED = 4096  # bytes of a line without an end
+MOST_UNSAID = 1000  # most lines that wait for a blocked terminal; further lines are lost
+LAST_WORDS = 2.0  # longest wait for the output of the last lines at the end of a run [s]
+MOST_TYPED = 4096  # most bytes kept of an incomplete line
 
 
 class Console:
-    """Says lines on standard error by a thread of its own: a terminal that is gone or stands still
-    holds up no tick.
+    """A printer to standard error with a separate thread, so that a closed or blocked terminal
+    delays no tick.
     """
 
     def __init__(self) -> None:
@@ -53,13 +53,13 @@ class Console:
         self._before: tuple[str, str] = ("", "")
 
     def say(self, text: str) -> None:
-        """Say a line; never waits and never raises."""
+        """Print a line; never wait and never raise."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(text)
 
     def decision(self, decision: TickRecord) -> None:
-        """Say a change of state with its reason, or what a state waits for; a reason that was just
-        said is not said again.
+        """Report a change of state with its reason, or what the state waits for; a reason is not
+        repeated.
         """
         head = f"{decision.time:12.3f} s  {decision.state:8} "
         if decision.state != self._before[0]:
@@ -80,14 +80,14 @@ class Console:
                 print(text, file=sys.stderr, flush=True)
 
     def close(self) -> None:
-        """Say what is left, where somebody listens."""
+        """Print the remaining lines, if the terminal accepts them in time."""
         with contextlib.suppress(queue.Full):
             self._lines.put_nowait(None)
         self._thread.join(LAST_WORDS)
 
 
 class Terminal:
-    """See `hil.control.loop.Operator`."""
+    """An operator at the terminal; implements `hil.control.loop.Operator`."""
 
     def __init__(
         self,
@@ -95,8 +95,8 @@ class Terminal:
         simulated: Callable[[], bool] = lambda: False,
         say: Callable[[str], None] = print,
     ):
-        """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the
-        run is ready, to a vehicle that has said that it is simulated and to no other.
+        """Handle the signals. ``say``: prints a line and never waits. ``auto_arm``: arm whenever
+        the run is ready, but only a vehicle that states that it is simulated.
         """
         self._auto = auto_arm
         self._simulated = simulated
@@ -138,7 +138,7 @@ class Terminal:
         return OperatorInput(arm, "land" in lines, "abort" in lines or bool(self._why), self._why)
 
     def _lines(self) -> set[str]:
-        """Return lines that were typed since the last call; half a line waits for its end."""
+        """Return the lines typed since the last call; an incomplete line waits for its end."""
         while self._file >= 0 and select.select([self._file], [], [], 0)[0]:
             try:
                 data = os.read(self._file, MOST_TYPED)

@@ -1,7 +1,7 @@
-"""Configuration of a run, one file of ``configs/hil``: its tables, whose fields stand beside the
-code that reads them.
+"""Configuration of a run, a file of ``configs/hil``. Most tables are defined beside the code that
+reads them.
 
-SI units; nothing about frames has a default.
+All values are in SI units; no convention of frames has a default.
 """
 
 from dataclasses import dataclass, field
@@ -32,10 +32,11 @@ from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
-# longest wait of a command [s]: a policy for a longer one was trained for another link
+# longest delay added to a command [s]: a longer one means that the policy was trained for another
+# link
 MOST_HOLD = 0.05
-LIVE = ("mavlink", "mocap")  # kinds of source that are no recording
-# order of quaternions of the sources that know only one
+LIVE = ("mavlink", "mocap")  # kinds of source that are not recordings
+# order of quaternions for sources with a fixed order
 ORDERS = {"bin": "wxyz", "ulg": "wxyz", "mocap": "xyzw"}
 
 
@@ -44,7 +45,7 @@ class LinkParams(Bounded):
     """The MAVLink link of source and autopilot."""
 
     device: str  # see hil.links.device
-    remote: bool  # whether the device may leave this machine
+    remote: bool  # whether the device may be on another machine
     system: MavlinkId  # our own
     component: MavlinkId  # likewise
     # accepted senders of datagrams, ADDRESS or ADDRESS:PORT; none: any
@@ -70,7 +71,7 @@ class SourceParams:
     mocap: MocapParams | None = None
     # of mavlink poses on a separate port, see hil.links.device; none: link.device
     device: str | None = None
-    check_units: bool = True  # refuse recordings with impossible numbers: a wrong unit
+    check_units: bool = True  # refuse recordings with impossible values: a wrong unit
 
     def __post_init__(self) -> None:
         if bool(self.columns) != (self.time is not None):
@@ -78,7 +79,7 @@ class SourceParams:
 
     @property
     def mapping(self) -> TableMap | None:
-        """Mapping of a table; None where it needs none."""
+        """Mapping of a table; None if it needs none."""
         return TableMap(self.time, self.columns) if self.time is not None else None
 
 
@@ -86,15 +87,15 @@ class SourceParams:
 class DelayParams(Bounded):
     """Ages of poses, and their compensation."""
 
-    # of a pose when it arrives [s], where its sender's clock is not known
+    # of a pose when it arrives [s], if its sender's clock is unknown
     source: Annotated[float, Bound(0.0, 0.5)]
-    # ask the senders of poses for their clock by TIMESYNC, and take ages from it where they answer
+    # whether to measure the clocks of pose senders by TIMESYNC, and to use them for ages
     synchronise: bool
-    compensate: bool  # predict poses to the age that the policy was trained with
-    # by which commands and releases act later than in training; poses are predicted as much
-    # further [s]
+    compensate: bool  # whether poses are predicted to the age that the policy was trained with
+    # additional delay of commands and releases compared with training; poses are predicted further
+    # by it [s]
     command: Annotated[float, Bound(0.0, MOST_PREDICTION)] = 0.0
-    # wait of each command: the vehicle acts sooner by this than in training [s]
+    # delay added to each command, because the vehicle acts sooner than in training [s]
     hold: Annotated[float, Bound(0.0, MOST_HOLD)] = 0.0
 
     def __post_init__(self) -> None:
@@ -108,8 +109,8 @@ class DelayParams(Bounded):
 
 @dataclass(frozen=True)
 class HilParams(Bounded):
-    """A run; raises `ConfigError` for a body without frames and for parts that contradict each
-    other.
+    """The configuration of a run. Raises `ConfigError`: a body lacks frames, or parts contradict
+    each other.
     """
 
     policy: str  # name of a shipped policy, or a file
@@ -119,9 +120,9 @@ class HilParams(Bounded):
     # Such a run waits for poses and checks without a time-out.
     observe: bool
     throws: Annotated[int, Bound(1)]  # after which the run lands
-    goal_w: Vector  # target where no body is the goal [m]
+    goal_w: Vector  # target if no body is the goal [m]
     home_w: Vector  # hover point [m]
-    landing_height: float  # of the payload's centre as it lands [m]
+    landing_height: float  # of the payload's centre at landing [m]
     link: LinkParams
     source: SourceParams
     frames: dict[str, FrameParams]  # by body: vehicle, payload and, if it moves, goal
@@ -135,15 +136,15 @@ class HilParams(Bounded):
     ardupilot: ArduPilotParams
     px4: Px4Params
     betaflight: BetaflightParams
-    crazyflie: CrazyflieParams | None = None  # where it is the back-end
+    crazyflie: CrazyflieParams | None = None  # required if it is the back-end
     # projected from the poses, or detected in a camera's pictures
     keypoints: Literal["projection", "detector"] = "projection"
     images: ImageParams | None = None  # of the detector
     realtime: RealtimeParams = field(default_factory=RealtimeParams)
-    aim: AimParams | None = None  # which releases are held back; None: none
-    # of a camera, in the hover before the first throw; None: none
+    aim: AimParams | None = None  # which releases are refused; None: none
+    # of the camera, in the hover before the first throw; None: no calibration
     calibration: CalibrationParams | None = None
-    team: TeamLinkParams | None = None  # that throws together; None: one vehicle
+    team: TeamLinkParams | None = None  # of vehicles that throw together; None: one vehicle
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -170,7 +171,9 @@ class HilParams(Bounded):
         return getattr(self, self.backend, None)
 
     def _missing_parts(self) -> tuple[tuple[bool, str], ...]:
-        """Return rules on tables and their combinations: whether each is broken, and its error."""
+        """Return rules on tables and their combinations: whether each is violated, and its
+        error.
+        """
         kind = self.source.kind
         detects = self.keypoints == "detector"
         return (
@@ -203,7 +206,7 @@ class HilParams(Bounded):
         )
 
     def _place_rules(self) -> tuple[tuple[bool, str], ...]:
-        """Return rules on places and fences: whether each is broken, and its error."""
+        """Return rules on positions and fences: whether each is violated, and its error."""
         fence = self.fence
         low = self.fence.payload_low
         high = self.fence.payload_high

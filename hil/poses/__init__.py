@@ -1,1 +1,1 @@
-"""Poses: what a source measures, from frames and axes over the gate to an estimated state."""
+"""Poses: sources, conversion of frames, the gate, and the estimation of states."""

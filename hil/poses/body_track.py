@@ -11,18 +11,17 @@ from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
 from visthrow.common.rotations import plus, turn_one
 
-# poses are carried forward by no more than this [s]; older ones are the timers' affair
+# longest prediction [s]; for older poses the gate's time-outs act
 MOST_PREDICTION = 0.1
 
 TRUST = 0.5
-"""Share of the estimated accelerations that velocity and rate are carried forward with: they are
-about as noisy as they are right. In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg, 100
-Hz) state and vision policy landed 0.029 and 0.028 m off with it, 0.043 and 0.035 m with all of the
-linear and none of the angular acceleration.
+"""Share of the estimated accelerations with which velocity and rate are predicted: their noise
+is about as large as their signal. In 160 simulated throws with poses 20 ms old (1 mm, 0.2 deg,
+100 Hz) state and vision policy landed 0.029 and 0.028 m off with it, 0.043 and 0.035 m with all
+of the linear and none of the angular acceleration.
 """
 
-# poses over which :meth:`Track.calm_speed` is taken: enough that noise of millimetres does not
-# count as motion
+# poses used by :meth:`Track.calm_speed`: so many that noise of millimetres does not count as motion
 CALM_SAMPLES = 20
 
 
@@ -38,18 +37,18 @@ class BodyState:
 
 
 class Track:
-    """Tracks one body.
+    """A tracker of one body.
 
     Attributes:
-        gate: accepts or refuses poses, and counts the refused ones. filter: estimates velocities.
+        gate: accepts or rejects poses, and counts the rejected ones. filter: estimates velocities.
         accepted: number of accepted poses. stream: judges rate and regularity.
     """
 
     def __init__(
         self, frames: FrameParams, gate: GateParams, estimate: EstimateParams, turns: bool = True
     ):
-        """Start without a pose; ``turns``: whether the body rate is wanted, which a bare ball does
-        without.
+        """Start without a pose; ``turns``: whether the body rate is needed, which it is not for
+        a payload.
         """
         self._turns = turns
         self.stream = Stream(gate, estimate)
@@ -60,18 +59,19 @@ class Track:
         self._pose: Pose | None = None
         self._vel: Vector = (0.0, 0.0, 0.0)
         self._slow: deque[tuple[float, Vector]] = deque(maxlen=CALM_SAMPLES)
-        # added to the stamps, so that a step of the source's clock leaves the filter's window whole
+        # added to the stamps, so that a step of the source's clock does not empty the filter's
+        # window
         self._shift = 0.0
 
     def restart(self) -> None:
-        """Forget all; see `hil.poses.gate.Gate.restart`."""
+        """Forget all poses; see `hil.poses.gate.Gate.restart`."""
         self.gate.restart()
         self.filter.reset()
         self._slow.clear()
         self._pose = None
 
     def update(self, raw: Pose, tether: Tether | None = None) -> str | None:
-        """Process a raw pose; return why it was refused, or None.
+        """Process a raw pose; return why it was rejected, or None.
 
         ``tether``: the cable's other end, if the payload is attached. A body whose rate is not
         needed may lack an attitude.
@@ -140,8 +140,8 @@ class Track:
         )
 
     def state(self, time: float, lead: float = 0.0) -> BodyState | None:
-        """Extrapolate the last accepted pose to a time [s], plus ``lead`` [s], with part of the
-        estimated accelerations; None before the first pose.
+        """Return the last accepted pose as a state at a time [s], predicted by ``lead`` [s] with
+        part of the estimated accelerations; None before the first pose.
         """
         pose = self._pose
         if pose is None:

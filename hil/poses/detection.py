@@ -1,9 +1,9 @@
-"""What a camera saw, as the policy is to be shown it: rays of one frame, and what they read until
-the next.
+"""Conversion of a camera's detections to the policy's keypoints, held from frame to frame.
 
-A frame counts for a while, then all reads as dropped out; what is not in it at once. To a policy
-that was trained with the exact direction at the edge in place of what is out of view, what was last
-seen near the edge reads as its direction there."""
+A frame is used for a limited time; then all keypoints count as dropped out. Keypoints that a frame
+lacks drop out at once. Some policies were trained with the exact direction at the image's edge for
+keypoints out of view. For them, keypoints last detected near the edge are shown at the edge in that
+direction."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ from hil.poses.pose import Quaternion, Vector
 from visthrow.common.rotations import continuous, matrix_of_quat
 from visthrow.onboard.calibration import Calibration
 
-# radius in the image beyond which what is not seen any more has left the field of view, of 1
+# normalised radius in the image beyond which a lost keypoint has left the field of view
 NEAR_EDGE = 0.85
-PATH = 25  # ticks that the vehicle's way is kept for: half a second
+PATH = 25  # ticks for which the vehicle's path is kept: half a second
 
 PARTS = {"goal": slice(0, GOAL_KEYPOINTS), "ball": slice(GOAL_KEYPOINTS, None)}  # of the keypoints
 Corners = tuple[Vector, ...]
@@ -34,7 +34,9 @@ Corners = tuple[Vector, ...]
 
 @dataclass(frozen=True)
 class Detection:
-    """One frame, plain floats as they are recorded; rays in the camera frame of training."""
+    """The detections in one frame, as recorded plain floats; rays in the camera frame of
+    training.
+    """
 
     stamp: float  # of the exposure, on the runner's clock [s]
     corners: Corners | None  # unit rays to the corners of the goal square, in turn
@@ -42,7 +44,7 @@ class Detection:
     ball: tuple[float, float, float, float] | None
 
     def values(self) -> list:
-        """Return it as JSON has it."""
+        """Return the values for JSON."""
         return [self.stamp, self.corners, self.ball]
 
     @classmethod
@@ -56,36 +58,36 @@ class Detection:
         )
 
     def frame_detections(self) -> FrameDetections:
-        """Return it as `camera.detectors.contours` has it."""
+        """Return the detections in the form of `camera.detectors.contours`."""
         goal = None if self.corners is None else GoalSeen(np.array(self.corners), 1.0)
         ball = None if self.ball is None else BallSeen(np.array(self.ball[:3]), self.ball[3], 1.0)
         return FrameDetections(ball, goal)
 
 
 class Detections:
-    """Keypoints by the detections so far; ``fresh``: stamp [s], keypoints (8, 2) and validity (8,)
-    of the last frame that was taken.
+    """The keypoints from the detections so far; ``fresh``: stamp [s], keypoints (8, 2) and
+    validity (8,) of the last frame.
     """
 
     def __init__(self, camera: KeypointCamera, hold: float):
-        """Start with nothing seen by the camera of training; ``hold``: for which a frame counts
-        [s].
+        """Start without detections; ``camera``: that of training; ``hold``: time for which a
+        frame is used [s].
         """
         self._camera = camera
         self._hold = hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
-        # of the last frame, where it holds the thing
+        # of the last frame, if it shows the object
         self._times = {"goal": -np.inf, "ball": -np.inf}
         self._newest = -np.inf
-        self._turn: ndarray | None = None  # from the camera as it is mounted to that of training
+        self._turn: ndarray | None = None  # from the mounted camera to that of training
         self._scale = 0.0
         self._latency = 0.0
         self._path: deque[tuple[float, ndarray, ndarray]] = deque(maxlen=PATH)
         self.fresh: tuple[float, ndarray, ndarray] | None = None
 
     def correct(self, calibration: Calibration) -> None:
-        """Turn rays and carry them forward from now on by what a calibration found."""
+        """Correct rays from now on for the tilt, scale and latency that a calibration found."""
         rot_cb = self._camera.rot_cb.double()
         turn = rotation_from_vector(torch.tensor(calibration.turn_b, dtype=torch.float64))
         self._turn = (rot_cb @ turn @ rot_cb.T).numpy()
@@ -93,14 +95,12 @@ class Detections:
         self._latency = max(calibration.latency, 0.0)
 
     def note_vehicle(self, time: float, pos: Vector, quat: Quaternion) -> None:
-        """Note where the vehicle is at a tick, as of the poses, for frames that are older than
-        these.
-        """
+        """Record the vehicle's pose at a tick, for frames that are older than the poses."""
         self._path.append((time, np.array(pos), np.array(quat)))
 
     def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
-        """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
-        at a tick [s].
+        """Process a frame; ``quat``: the vehicle's attitude, which identifies the corners;
+        ``aged``: age of the poses at a tick [s].
         """
         stamp = detection.stamp
         frame = detection.frame_detections()
@@ -119,9 +119,7 @@ class Detections:
                 self._valid[part] = valid[part]
 
     def problems(self, time: float) -> list[str]:
-        """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies
-        in view are seen.
-        """
+        """Return the problems that forbid a throw at a time [s]: ball or goal are not detected."""
         return [
             f"the pictures show no {name}"
             for name, stamp in self._times.items()
@@ -129,8 +127,8 @@ class Detections:
         ]
 
     def _carry(self, detections: FrameDetections, when: float) -> FrameDetections:
-        """Return what was seen at a time as the camera of training would see it now: the goal lies,
-        the ball goes with the vehicle.
+        """Return detections of a time as the camera of training would see them now: the goal
+        lies still, the ball moves with the vehicle.
         """
         _, pos_now, quat_now = self._path[-1]
         pos, quat = self._pose(when)
@@ -154,15 +152,15 @@ class Detections:
         return FrameDetections(ball, goal)
 
     def _rescale(self, rays_c: ndarray) -> ndarray:
-        """Return rays, shape (N, 3), by the focal length that was found."""
+        """Return rays, shape (N, 3), corrected for the calibrated focal length."""
         lens = self._camera.fisheye
         points, _ = lens.project_normalized(torch.from_numpy(np.ascontiguousarray(rays_c)))
         rays: ndarray = lens.unproject(lens.denormalize(points / (1.0 + self._scale)))[0].numpy()
         return rays
 
     def _pose(self, when: float) -> tuple[ndarray, ndarray]:
-        """Return the place and the quaternion, of any length, at a time on the path, by straight
-        lines; its ends beyond them.
+        """Return position and quaternion (not normalised) on the path at a time, by linear
+        interpolation; beyond the path, its ends.
         """
         times, places, quats = map(np.array, zip(*self._path))
         columns = np.column_stack([places, continuous(quats)])

@@ -1,12 +1,13 @@
-"""Velocity and body rate where the source gives none: a causal polynomial fit over the last poses.
+"""Estimation of velocity and body rate by a causal polynomial fit over the last poses, if the
+source gives none.
 
-Over the N samples of a window of time, whatever the source's rate, a line (order 1) or a parabola
-(order 2) is fitted by least squares, with the samples' own time stamps, and its slope is taken at
-the newest one. Under constant acceleration a line's slope is late by half the window, ``(N - 1) T /
-2`` at an even spacing T; a parabola's is not late at all, but noisier. For slopes ``v = sum c_i p(t
-- a_i)`` of samples of age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to ``p = t^2 /
-2`` is ``t`` less the lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is
-``sqrt(sum c_i^2)`` times that of a sample."""
+A line (order 1) or a parabola (order 2) is fitted by least squares to the N samples in a window of
+time, with their time stamps; its slope at the newest sample is the estimate. Under constant
+acceleration the slope of a line lags by half the window, ``(N - 1) T / 2`` at an even spacing T.
+That of a parabola has no lag, but more noise. For slopes ``v = sum c_i p(t - a_i)`` of samples of
+age a_i the lag is ``-sum c_i a_i^2 / 2`` [s] (the response to ``p = t^2 / 2`` is ``t`` less the
+lag), which is what :attr:`SlopeFilter.lag` reports. The slope's noise is ``sqrt(sum c_i^2)`` times
+that of a sample."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -16,16 +17,16 @@ from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import conjugate, multiply, rotation_vector
 from visthrow.config.bounds import Bound, Bounded
 
-# a gap longer than this empties the window: what lies before it says nothing of now [s]
+# a gap longer than this empties the window: samples before it are outdated [s]
 MOST_GAP = 0.1
-MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost stays bounded
+MOST_SAMPLES = 32  # in a window, to bound the cost of the fit
 
 
 @dataclass(frozen=True)
 class EstimateParams(Bounded):
-    """The filter."""
+    """Parameters of the filter."""
 
-    # age of the oldest sample, where there are enough younger ones [s]
+    # largest age of a sample, if there are enough younger ones [s]
     window: Annotated[float, Bound(0.0, MOST_GAP, "(]")]
     order: Annotated[int, Bound(1, 2)]  # 1: line, 2: parabola
 
@@ -34,8 +35,8 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
     """Return weights c_i of samples of given ages [s], newest first, in the slope at age 0 [1/s],
     and in the second derivative [1/s^2].
 
-    With too few samples for the order the order is lowered; with one sample the slope is 0. The
-    second one of a line is 0."""
+    With too few samples the order is lowered; with one sample the slope is 0. The second derivative
+    of a line is 0."""
     order = min(order, len(ages) - 1)
     none = [0.0] * len(ages)
     if order < 1:
@@ -71,11 +72,11 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
 
 
 class SlopeFilter:
-    """Velocity, acceleration and body rate of one body; ``acceleration`` is of the last estimate
-    [m/s^2], world frame, 0 for a line.
+    """An estimator of velocity, acceleration and body rate of one body; ``acceleration`` is the
+    last estimate [m/s^2], world frame, 0 for a line.
 
-    The rate is worked out when it is asked for: many poses may come between two ticks, and a bare
-    ball's is never asked for."""
+    The body rate is computed on demand, because many poses may arrive between two ticks, and a
+    payload's rate is never used."""
 
     def __init__(self, params: EstimateParams):
         self.params = params
@@ -84,7 +85,7 @@ class SlopeFilter:
         self._ages: list[float] = []
         self._weights: list[float] = []
         self._bends: list[float] = []
-        self._rate: Vector | None = None  # until it is asked for
+        self._rate: Vector | None = None  # None until it is computed
         self._spin: Vector = (0.0, 0.0, 0.0)
 
     def reset(self) -> None:
@@ -92,8 +93,8 @@ class SlopeFilter:
         self._window.clear()
 
     def update(self, pose: Pose) -> Vector:
-        """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the
-        source's own where it gives one.
+        """Add a pose in our frames, newer than the last, and return its velocity, world frame
+        [m/s]: the source's, if it gives one.
         """
         window = self._window
         params = self.params
@@ -113,7 +114,7 @@ class SlopeFilter:
 
     @property
     def rate(self) -> Vector:
-        """Body rate at the last pose, body frame [rad/s]; the source's own where it gives one, 0
+        """Body rate at the last pose, body frame [rad/s]: the source's, if it gives one; 0
         without an attitude.
         """
         if self._rate is None:
@@ -129,16 +130,16 @@ class SlopeFilter:
 
     @property
     def spin(self) -> Vector:
-        """Change of the body rate at the last pose, body frame [rad/s^2]; 0 for a line, and where
-        the source gives rates.
+        """Angular acceleration at the last pose, body frame [rad/s^2]; 0 for a line, and if the
+        source gives rates.
         """
-        _ = self.rate  # works it out along with itself
+        _ = self.rate  # computes the spin too
         return self._spin
 
     @property
     def lag(self) -> float:
-        """Lag of the last estimates under constant acceleration [s]; 0 where the source gave both
-        itself.
+        """Lag of the last estimates under constant acceleration [s]; 0 if the source gives
+        velocity and rate.
         """
         if not self._window:
             return 0.0

@@ -1,8 +1,8 @@
-"""Conversion between a pose source's frames and ours: the only place where axes are exchanged.
+"""Conversion between a pose source's frames and ours; axes are exchanged only here.
 
 Ours: world z up, body x forward, y left, z up, quaternions xyzw. A source's axes are described by
 three signed letters: ``axes = "y,x,-z"`` says that our world x is the source's y, our y its x, our
-z its -z. Of the 48 such sets 24 are turns; the others mirror the world and are refused. Common
+z its -z. Of the 48 such sets 24 are rotations; the others are reflections and are refused. Common
 sets:
 
 - ``"x,y,z"``: z up already (Vicon, Qualisys, ROS).
@@ -33,16 +33,16 @@ from visthrow.logs.axes import turn_of
 
 @dataclass(frozen=True)
 class FrameParams(Bounded):
-    """Conventions of a source's poses.
+    """The conventions of a source's poses.
 
-    Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn.
+    No entry has a default. Raises `FrameError`: the axes are not a rotation.
     """
 
     axes: str  # our world axes in the source's, for instance "y,x,-z"
     # our body axes in those of the source's body, for instance "x,-y,-z" for forward, right, down
     body_axes: str
     quaternion: Literal["xyzw", "wxyz"]  # order of the source's quaternions
-    yaw_offset_deg: float  # turn about our world z after the exchange of axes
+    yaw_offset_deg: float  # rotation about our world z after the exchange of axes
     # of the tracked point from the centre of mass [m], our body frame
     marker_offset_b: Vector
 
@@ -57,11 +57,11 @@ class FrameParams(Bounded):
 class Frames:
     """Converts poses, vectors and rates of one body between a source's frames and ours, both ways.
 
-    Plain floats all along: a batch of one in NumPy costs ten times as much, and the same input
-    gives the same bits."""
+    It uses plain floats: NumPy is ten times slower for a single pose, and equal inputs give equal
+    bits."""
 
     def __init__(self, params: FrameParams):
-        """Work out the turns; see `FrameParams` for what is refused."""
+        """Compute the rotations; see `FrameParams` for the errors."""
         self.params = params
         half = math.radians(params.yaw_offset_deg) / 2.0
         yaw = (0.0, 0.0, math.sin(half), math.cos(half))
@@ -71,7 +71,7 @@ class Frames:
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 
     def world_from_source(self, vector: Vector) -> Vector:
-        """Return a vector of the source's world in ours."""
+        """Return a vector of the source's world in our world."""
         return rotate_one(self._world, vector)
 
     def source_from_world(self, vector: Vector) -> Vector:
@@ -79,7 +79,7 @@ class Frames:
         return rotate_one(conjugate(self._world), vector)
 
     def quat_from_source(self, quat: Quaternion) -> Quaternion:
-        """Return an attitude as the source writes it, as ours (xyzw, body to world)."""
+        """Return a source's attitude in our convention (xyzw, body to world)."""
         if self.params.quaternion == "wxyz":
             quat = (*quat[1:], quat[0])
         return multiply(multiply(self._world, quat), conjugate(self._body))
@@ -99,7 +99,9 @@ class Frames:
         return replace(pose, pos=pos, quat=quat, vel=vel, rate=rate)
 
     def source_from_pose(self, pose: Pose) -> Pose:
-        """Return the inverse of :meth:`pose_from_source`: what the source would have said."""
+        """Return the source's pose for a pose in our frames; the inverse of
+        :meth:`pose_from_source`.
+        """
         pos = pose.pos
         vel = pose.vel
         if pose.quat is not None and any(self._offset):
@@ -119,8 +121,8 @@ class Frames:
 
 
 def _quaternion(matrix: np.ndarray) -> Quaternion:
-    """Return the quaternion xyzw of one of the 24 turns: its numbers, 0, 1/2, sqrt(1/2) or 1,
-    exactly, so that "x,y,z" changes no bit.
+    """Return the quaternion xyzw of one of the 24 rotations. Its magnitudes are exactly 0, 1/2,
+    sqrt(1/2) or 1, so that "x,y,z" changes no bit.
     """
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
     exact = np.concatenate([-exact, exact])

@@ -1,17 +1,18 @@
-"""Gate of a body: refuses wrong poses, and says how old the last new one is (warn, hold, abort:
+"""Gate of a body: it rejects wrong poses, and gives the age of the last new one as a level (warn,
+hold, abort:
 
 ``[gate]``).
 
-A motion-capture system that has lost a body goes on sending its *last* pose, so staleness is judged
-on content: the time since a pose last *differed* from the one before. A body that jumps is refused
-and stays refused: a pose must lie where the last accepted one and its velocity put the body, within
-a room that grows with the time in which *nothing* came, not with the time in which wrong poses
-came. So two bodies that the system has swapped never become right again by waiting; their timers
-run out and the runner ends the throw. Swapped after a gap, which leaves room for both, they are
-known by the cable: of poses off their way, one that fits the body at the cable's other end better
-is not taken, nor one farther off than the cable is long. A body that goes its way is followed,
-however far: a payload that has come off takes no pose of the vehicle with it. Poses that keep
-coming, but more rarely than ``hold``, are as good as none."""
+A motion-capture system that has lost a body keeps sending its *last* pose. So staleness is judged
+by content: the time since a pose last *differed* from the one before. After a jump, a body stays
+rejected: a pose must lie near the prediction from the last accepted pose and its velocity. The
+tolerance grows with the time in which *no* pose arrived, not with the time in which wrong ones
+arrived. So two bodies that the system has swapped are never accepted again by waiting: their poses
+become stale and the runner ends the throw. After a gap the tolerance may admit a swap; then the
+cable reveals it. A pose far from its prediction is rejected if it is closer to the body at the
+cable's other end, or farther from that body than the cable's length. A body that moves as predicted
+is accepted at any distance, such as a payload that has detached. Poses less frequent than ``hold``
+count as missing."""
 
 import math
 from collections import Counter
@@ -23,9 +24,9 @@ from visthrow.common.rotations import plus
 from visthrow.config.bounds import Bounded, Positive
 
 OK, WARN, HOLD, ABORT = range(4)  # levels of staleness
-MOST_ACCELERATION = 40.0  # by which a body may have changed its velocity while nothing came [m/s^2]
-MOST_STAMP = 1e11  # stamps beyond it [s] cannot tell poses 20 us apart; the year 5138
-RARE = 3  # gaps longer than ``hold`` in a row that count as no poses at all
+MOST_ACCELERATION = 40.0  # assumed limit of a body's acceleration while no pose arrived [m/s^2]
+MOST_STAMP = 1e11  # largest stamp [s], year 5138: beyond it, floats do not resolve 20 us
+RARE = 3  # consecutive gaps longer than ``hold`` after which poses count as missing
 
 
 REASONS = {
@@ -43,7 +44,7 @@ REASONS = {
     "turn": "turns faster than gate.max_turn_rate",
     "reset": "the source's reset counter has changed",
 }
-"""Why a pose is refused, in words."""
+"""Reason for a rejection -> its text."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Tether:
     """The other end of the cable while the payload hangs on it."""
 
     pos: Vector  # of the other body, expected at the pose's arrival [m]
-    length: float  # that the two can be apart [m]; infinite where the other body is not known well
+    length: float  # largest distance of the two [m]; infinite if the other body's pose is stale
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,13 @@ class GateParams(Bounded):
     """Limits of one body."""
 
     quat_tolerance: Positive  # of a quaternion's norm from 1 [-]
-    max_jump: Positive  # from where the last pose and velocity put the body [m]
+    max_jump: Positive  # from the position predicted by the last pose and velocity [m]
     max_speed: Positive  # [m/s]
-    # between two poses, beyond max_turn_rate times the time in which nothing came [rad]
+    # between two poses, beyond max_turn_rate times the time in which no pose arrived [rad]
     max_turn: Positive
     max_turn_rate: Positive  # [rad/s]
-    # stamps that leave the arrivals by more than this are a step of the source's clock [s]
+    # difference between intervals of stamps and of arrivals that counts as a step of the source's
+    # clock [s]
     clock_step: Positive
     warn: Positive  # content age [s]
     hold: Positive  # content age [s]
@@ -80,8 +82,9 @@ class GateParams(Bounded):
 
 
 class Gate:
-    """Decides about one body's poses; ``last`` is the accepted one, ``refused`` counts by reason,
-    ``jumped``: the source's reset counter has changed since the last :meth:`restart`.
+    """Accepts or rejects one body's poses; ``last`` is the last accepted one, ``refused`` counts
+    rejections by reason, ``jumped`` states whether the source's reset counter has changed since
+    the last :meth:`restart`.
     """
 
     def __init__(self, params: GateParams):
@@ -90,9 +93,9 @@ class Gate:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all: the next good pose is taken wherever it is.
+        """Forget all poses: the next valid pose is accepted wherever it is.
 
-        On the ground only, at the operator's word.
+        Only for use on the ground, before the take-over.
         """
         self.last: Pose | None = None
         self.jumped = False
@@ -103,10 +106,10 @@ class Gate:
     def check(
         self, pose: Pose, velocity: Vector | None = None, tether: Tether | None = None
     ) -> str | None:
-        """Judge a pose, in our frames, by the body's velocity at its last accepted pose [m/s] and
-        the cable's other end, where one hangs.
+        """Check a pose in our frames, given the body's velocity at its last accepted pose [m/s] and
+        the cable's other end, if the payload is attached.
 
-        Returns why it is refused, or None where it is accepted; `REASONS` says what each means."""
+        Returns the reason of the rejection, a key of `REASONS`, or None if the pose is accepted."""
         reason = self._reason(pose, velocity, tether)
         if reason is not None:
             self.refused[reason] += 1
@@ -144,7 +147,7 @@ class Gate:
         self._came = pose
         if same:
             return "repeated"
-        # A clock that was set says nothing of how long ago the last pose was; the arrivals do.
+        # After a step of the clock only the arrivals show how long ago the last pose was.
         age, gap = (
             max(pose.arrival - earlier.arrival if stepped else pose.stamp - earlier.stamp, 0.0)
             for earlier in (last, previous)
@@ -152,11 +155,11 @@ class Gate:
         return self._motion(pose, last, velocity, tether, age, gap)
 
     def _itself(self, pose: Pose) -> str | None:
-        """Return what is wrong with a pose, whatever came before."""
+        """Return what is wrong with a pose by itself, or None."""
         p = self.params
         if not pose.valid:
             return "invalid"
-        # Checked first: without an attitude, numbers in the body's axes are NaN as well.
+        # Checked first: without an attitude, values in body axes are NaN too.
         if not all(map(math.isfinite, pose.quat or ())):
             return "attitude"
         numbers = (pose.stamp, pose.arrival, *pose.pos, *(pose.vel or ()), *(pose.rate or ()))
@@ -179,8 +182,8 @@ class Gate:
         age: float,
         gap: float,
     ) -> str | None:
-        """Return what is wrong with the way from the last accepted pose of an age [s], after a gap
-        in which nothing came at all [s].
+        """Return what is wrong with the motion since the last accepted pose, or None; ``age``:
+        of that pose [s]; ``gap``: time without any pose [s].
         """
         p = self.params
         expected = last.pos if velocity is None else plus(last.pos, velocity, age)
@@ -207,7 +210,7 @@ class Gate:
 
     def level(self, time: float) -> int:
         """Return :data:`OK`, :data:`WARN`, :data:`HOLD` or :data:`ABORT` by the content's age;
-        ABORT where content is rare.
+        ABORT if poses are too rare.
         """
         if self._gaps >= RARE:
             return ABORT

@@ -1,9 +1,10 @@
-"""The hand-carry check: an operator carries the vehicle in a stated order, and its poses show the
+"""The hand-carry check: an operator carries the vehicle through given moves, and its poses show the
 source's axes.
 
-It starts level, its nose along our x, with a second of rest before and after each move. Three
-translations show the world's axes, three turns the body's and the quaternion's order. The result is
-the one of 24 axis cases each, and of two orders, under which every move goes as stated."""
+It starts level, with its nose along our x, and rests for a second before and after each move. Three
+translations show the world's axes; three rotations show the body's axes and the quaternion's order.
+Of 24 sets of axes for world and body each, and two orders, those are found under which the moves
+agree best with the instructions."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,15 +30,15 @@ from visthrow.common.rotations import (
 )
 from visthrow.logs.axes import TURNS, turn_of
 
-# below both the vehicle rests: noise of a millimetre and of 0.3 deg stays below
+# limits below which the vehicle counts as resting, above noise of a millimetre and 0.3 deg
 SPEED = 0.06  # [m/s]
 RATE = 0.25  # [rad/s]
-SPAN = 0.2  # over which speed and rate are taken [s]
+SPAN = 0.2  # interval for speed and rate [s]
 REST_TIME = 0.5  # shortest rest [s]
 LEAST_WAY = 0.2  # of a move [m]
 LEAST_TURN = math.radians(15.0)  # likewise [rad]
 POLL_INTERVAL = 0.25  # [s]
-TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
+TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not move straight [rad]
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class CarryMove:
     """One step of the check."""
 
     text: str  # for the operator
-    turn: bool  # of the attitude, else of the place
-    # of our axes along or about which it goes; None for the way back, which is not judged
+    turn: bool  # whether it is a rotation, else a translation
+    # our axis along or about which it goes; None for a move back, which is not judged
     axis: int | None
 
 
@@ -64,14 +65,14 @@ MOVES = (
 
 @dataclass(frozen=True)
 class MeasuredMove:
-    """A move as the source tells it, in its own frames."""
+    """A move as measured by the source, in its frames."""
 
-    before: Pose  # mean of the rest before
-    after: Pose  # mean of the rest after
+    before: Pose  # mean pose of the rest before
+    after: Pose  # mean pose of the rest after
 
     @property
     def way(self) -> ndarray:
-        """Change of place [m], shape (3,), source's world."""
+        """Change of position [m], shape (3,), source's world."""
         return np.subtract(self.after.pos, self.before.pos)
 
     @property
@@ -93,18 +94,18 @@ Line = tuple[str, bool]  # judgement of one move: in words, and whether it passe
 
 @dataclass(frozen=True)
 class CarryResult:
-    """Outcome of the check."""
+    """The result of the check."""
 
     lines: tuple[Line, ...]
     fitting: FrameParams  # under which the moves fit best
-    # a left-handed source would fit better: left and right exchanged, or the axes are
+    # whether the moves fit a left-handed source: axes are mirrored, or a move went the wrong way
     mirrored: bool
     passed: bool
 
 
 def find_steps(poses: Sequence[Pose]) -> list[MeasuredMove]:
-    """Return moves between rests, of raw poses of the vehicle in order; raises `RunError` for one
-    without attitude.
+    """Return the moves between rests from the vehicle's raw poses, in order. Raises `RunError`:
+    a pose has no attitude.
     """
     if any(pose.quat is None for pose in poses):
         raise RunError(
@@ -129,7 +130,7 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     late = np.minimum(np.searchsorted(times, times + SPAN), len(times) - 1)
     early = np.maximum(np.searchsorted(times, times - SPAN, side="right") - 1, 0)
     span = np.maximum(times[late] - times[early], 1e-9)
-    # the angle of a turn is the same whatever the order of the quaternions
+    # the angle of a rotation does not depend on the order of the quaternions
     rate = norm(vectors_between(quat[early], quat[late]), axis=1) / span
     resting = (norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
     turns = np.diff(resting, prepend=False, append=False)
@@ -150,8 +151,8 @@ def _mean(poses: Sequence[Pose], span: slice) -> Pose:
 
 
 def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
-    """Judge each move by the config's frames, and find the frames that fit best; raises `RunError`
-    for another number of moves than `MOVES`.
+    """Judge each move with the config's frames, and find the frames that fit best. Raises
+    `RunError`: the number of moves is not that of `MOVES`.
     """
     if len(steps) != len(MOVES):
         moves = "; ".join(f"{i}. {move.text}" for i, move in enumerate(MOVES, start=1))
@@ -180,13 +181,13 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
 
 
 def _agreement(turn: ndarray, vectors: list[tuple[int, ndarray]]) -> float:
-    """Return the sum of the cosines between turned vectors and the axes that they belong to."""
+    """Return the sum of the cosines between rotated vectors and their axes."""
     return sum(float((turn @ v)[axis] / max(norm(v), 1e-12)) for axis, v in vectors)
 
 
 def _yaw(ways: list[tuple[int, ndarray]], world: ndarray) -> float:
-    """Return the turn about our z that is left after the exchange of axes [deg]; 0 where it may be
-    the walker's.
+    """Return the remaining rotation about our z after the exchange of axes [deg]; 0 if it is so
+    small that the operator may have caused it.
     """
     forward, leftward = (world @ ways[i][1] for i in (0, 1))
     angle = math.degrees(math.atan2(-forward[1] + leftward[0], forward[0] + leftward[1]))
@@ -207,7 +208,7 @@ def _line(move: CarryMove, step: MeasuredMove, frames: FrameParams) -> Line:
 
 
 def _start(pose: Pose, frames: FrameParams) -> Line:
-    """Return the attitude at first, which is to be level with the nose along our x."""
+    """Return the judgement of the initial attitude: level, with the nose along our x."""
     tilt, heading = tilt_and_heading(Frames(frames).quat_from_source(pose.quat))
     return (
         (
@@ -226,8 +227,8 @@ def collect(
     tell: Callable[[str], None] = lambda text: None,
     recorded: bool = False,
 ) -> list[MeasuredMove]:
-    """Take in the vehicle's poses until all moves were made, or for a time [s]; a recording to its
-    end. ``tell`` hears each move.
+    """Collect the vehicle's poses until all moves are made or a time [s] is over, or to the end
+    of a recording, and return the moves. ``tell``: called with the text of each next move.
     """
     poses: list[Pose] = []
     steps: list[MeasuredMove] = []
@@ -248,7 +249,7 @@ def collect(
 
 
 def summary_text(finding: CarryResult, frames: FrameParams) -> str:
-    """Return the outcome in words."""
+    """Return the result as text."""
     lines = [f"{'PASS' if passed else 'FAIL'}  {text}" for text, passed in finding.lines]
     if finding.mirrored:
         lines.append(

@@ -1,6 +1,6 @@
-"""One measured pose: what every source hands on and the runner reads.
+"""The pose of one body, as sources deliver it to the runner.
 
-Plain floats, so that it is recorded exactly.
+It holds plain floats, so that it is recorded exactly.
 """
 
 import math
@@ -18,19 +18,19 @@ BODIES = (VEHICLE, PAYLOAD, GOAL)
 
 
 ZEROS = ([0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-"""Attitudes that captures write for a body that they do not see, sorted: zeros, or no turn."""
+"""Sorted quaternions that motion-capture systems write for a body that they do not see: zeros,
+or the identity.
+"""
 
 
 def has_attitude(quat: Quaternion | None) -> bool:
-    """Return whether an attitude is known: single markers have NaN or zeros there."""
+    """Return whether an attitude is known: for single markers it is NaN or zero."""
     return quat is not None and not any(map(math.isnan, quat)) and any(quat)
 
 
 @dataclass(frozen=True)
 class Pose:
-    """A pose of one body: as its source says it until `hil.poses.frames` has converted it, then in
-    our world.
-    """
+    """A pose of one body, in its source's frames until `hil.poses.frames` converts it to ours."""
 
     stamp: float  # on the source's clock [s]
     arrival: float  # on the runner's monotonic clock [s]
@@ -38,15 +38,17 @@ class Pose:
     pos: Vector  # [m]
     # attitude, body to world, in the order of the source (ours is xyzw); None for a bare marker
     quat: Quaternion | None = None
-    vel: Vector | None = None  # [m/s], world frame; None where the source gives none
-    rate: Vector | None = None  # [rad/s], body frame; None where the source gives none
-    reset: int = 0  # counter of the source's estimator; a change says that it jumped
-    measured: float | None = None  # on the runner's clock [s], where the source's clock is known
-    valid: bool = True  # False where the source itself says that it does not see the body
+    vel: Vector | None = None  # [m/s], world frame; None if the source gives none
+    rate: Vector | None = None  # [rad/s], body frame; None if the source gives none
+    reset: int = 0  # counter of the source's estimator; it changes when the estimate jumps
+    measured: float | None = (
+        None  # on the runner's clock [s]; None if the source's clock is unknown
+    )
+    valid: bool = True  # False if the source reports that it does not see the body
 
     def is_lost(self) -> bool:
-        """Return whether a raw pose is that of a body which its source does not see: called so, or
-        written as zeros, which no measurement is.
+        """Return whether the source does not see the body of a raw pose: it reports so, or
+        writes zeros, which no measurement gives.
         """
         return not self.valid or (
             not any(self.pos)
@@ -54,5 +56,5 @@ class Pose:
         )
 
     def transit(self, usual: float) -> float:
-        """Return the time from measurement to arrival [s]: known, or what is usual."""
+        """Return the time from measurement to arrival [s]; ``usual`` if it is unknown."""
         return usual if self.measured is None else self.arrival - self.measured

@@ -1,7 +1,7 @@
-"""How the poses of a body come: their rate and gaps, what is refused, what their stamps are worth.
+"""Statistics of the stream of a body's poses: rate, gaps, rejections and quality of the stamps.
 
-The run and ``visthrow hil check`` judge by it alike before a vehicle is taken over; each problem
-says what was measured, what is needed and what to do."""
+The run and ``visthrow hil check`` judge the stream by the same limits before the take-over. The
+text of each problem states what was measured, what is required and what to do."""
 
 import math
 from collections import Counter, deque
@@ -13,28 +13,28 @@ from hil.poses.estimate import MOST_SAMPLES, EstimateParams
 from hil.poses.gate import REASONS, GateParams
 from hil.poses.pose import Pose
 
-WINDOW = 2.0  # of arrivals that are looked at [s]
-SETTLING = 0.5  # of arrivals before anything is judged [s]
+WINDOW = 2.0  # of arrivals that are judged [s]
+SETTLING = 0.5  # time of arrivals before the first judgement [s]
 JUDGE_INTERVAL = 0.1  # between two judgements [s]
 MOST_KEPT = 10_000  # poses in a window
 
-MOST_REFUSED = 0.05  # share of poses that the gate may refuse beside repeated ones
+MOST_REFUSED = 0.05  # share of poses that the gate may reject beside repeated ones
 MOST_STALE = 0.1  # share of time in which the content may be older than gate.warn
 MOST_DRIFT = 0.1  # by which a second of stamps may differ from one of arrivals
 MOST_CLOSE = 0.2  # share of intervals that may be shorter than a quarter of their mean
 
 LEAST_SCATTER = 0.0015
 SCATTER = 0.2
-"""Scatter of intervals that is put up with [s], or as a share of their mean: at 3 m/s it moves a
-pose by less than a centimetre.
+"""Tolerated scatter of intervals [s], and as a share of their mean: at 3 m/s the error of a
+position is less than a centimetre.
 """
 
 
 @dataclass(frozen=True)
 class Flow:
-    """Statistics of a body's poses over the last seconds; NaN where there are too few."""
+    """Statistics of a body's poses over the last seconds; NaN with too few poses."""
 
-    count: int  # of poses that came
+    count: int  # of received poses
     rate: float  # of accepted ones [Hz]
     refused: Counter  # by reason
     gap: float  # longest time without an accepted one [s]
@@ -48,7 +48,7 @@ class Flow:
     transit: float  # spread of arrival less stamp, 10 to 90 %, where no clock is known [s]
 
     def text(self) -> str:
-        """Return the regularity in words."""
+        """Return a text on the regularity."""
         return (
             f"gaps up to {1e3 * self.gap:.0f} ms, {100 * self.close:.0f} % of the arrivals bunched,"
             f" stamps scatter by {1e3 * self.scatter:.1f} ms"
@@ -56,10 +56,10 @@ class Flow:
 
 
 class Stream:
-    """Watches the poses of one body."""
+    """A monitor of one body's poses."""
 
     def __init__(self, gate: GateParams, estimate: EstimateParams):
-        """Take what the gate and the estimate need."""
+        """Set the parameters of the gate and the estimate, from which the limits follow."""
         self._gate = gate
         self._estimate = estimate
         self._rows: deque[tuple[float, float, str | None, bool]] = deque(maxlen=MOST_KEPT)
@@ -67,7 +67,7 @@ class Stream:
         self._judged: tuple[float, list[str]] = (-math.inf, [])
 
     def note(self, pose: Pose, reason: str | None) -> None:
-        """Take a raw pose and why it was refused, or None."""
+        """Record a raw pose and why it was rejected, or None."""
         if self._first is None:
             self._first = pose.arrival
         rows = self._rows
@@ -76,7 +76,9 @@ class Stream:
             rows.popleft()
 
     def flow(self, time: float) -> Flow | None:
-        """Return what came lately, at a time [s]; None before enough time has passed."""
+        """Return the statistics of the last seconds at a time [s]; None before enough time has
+        passed.
+        """
         if self._first is None or time - self._first < SETTLING:
             return None
         begin = max(self._first, time - WINDOW)
@@ -107,8 +109,8 @@ class Stream:
         )
 
     def problems(self, time: float) -> list[str]:
-        """Return why no estimate is to be made of the last seconds' poses, in words; judged anew
-        every :data:`JUDGE_INTERVAL`.
+        """Return texts on why the last seconds' poses are not good enough for an estimate;
+        updated every :data:`JUDGE_INTERVAL`.
         """
         if time - self._judged[0] >= JUDGE_INTERVAL:
             self._judged = (time, self._judge(time))
@@ -130,7 +132,7 @@ class Stream:
         return problems or self._times(flow)
 
     def _stamps(self, flow: Flow) -> list[str]:
-        """Return what is wrong with the stamps, the first reason alone: others follow from it."""
+        """Return the first problem of the stamps only, because others follow from it."""
         first, last, different = flow.stamps
         if "stamp" in flow.refused:
             return []
@@ -152,7 +154,7 @@ class Stream:
         return []
 
     def _times(self, flow: Flow) -> list[str]:
-        """Return what is wrong with rate and regularity."""
+        """Return the problems of rate and regularity."""
         gate = self._gate
         estimate = self._estimate
         lowest = estimate.order / estimate.window
@@ -199,8 +201,8 @@ def _share_close(intervals: np.ndarray) -> float:
 
 
 def _scatter(intervals: np.ndarray) -> float:
-    """Return the scatter of intervals about whole multiples of their median, as where poses are
-    lost [s].
+    """Return the scatter of intervals about whole multiples of their median, which lost poses
+    cause [s].
     """
     if not len(intervals):
         return math.nan
