@@ -67,8 +67,8 @@ def _is_loopback(device: str) -> bool:
 
 
 def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and write the run's folder; return 1 for a run that was aborted or in which
-    something raised, else 0.
+    """Fly, or run dry, and write the run's folder; return 1 if the run was aborted or an
+    exception was raised, else 0.
     """
     start = time.monotonic()
     params = run_params(args)
@@ -125,7 +125,7 @@ def run_params(args: argparse.Namespace) -> HilParams:
 def _prepare(
     args: argparse.Namespace, params: HilParams, folder: Path, console: Console
 ) -> tuple[Loop, Link | None]:
-    """Return the loop of a run, and the autopilot's link where there is one."""
+    """Return the loop of a run, and the autopilot's link, if any."""
     flies = args.action == "run"
     policy = Policy.load(find_policy(params.policy))
     source, link, clock = open_source(
@@ -135,7 +135,7 @@ def _prepare(
     write = flies and args.write_parameters
     backend = make_backend(params, link, write, console.say, folder)
     runner = Runner(params, policy, backend, mechanism_lag(params))
-    runner.estimator.watcher = getattr(backend, "place", None)  # who wants the vehicle's poses
+    runner.estimator.watcher = getattr(backend, "place", None)  # if it uses the vehicle's poses
     refused = prepare(params.realtime)
     runner.commander.warm_up()
     eyes = None
@@ -165,7 +165,7 @@ def _team(params: HilParams, period: float, clock: Clock, speed: float) -> TeamL
 
 
 def _exit_status(summary: dict[str, Any], folder: Path) -> int:
-    """Return 1 for a failed run, after it was packed, else 0."""
+    """Return 1 for a failed run, after packing it, else 0."""
     if not (summary["aborted"] or summary["errors"]):
         return 0
     with contextlib.suppress(RunError):

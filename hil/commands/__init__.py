@@ -1,4 +1,6 @@
-"""Actions of ``visthrow hil`` and their options; what does an action is imported when it runs."""
+"""Actions of ``visthrow hil`` and their options; the module of an action is imported when it
+runs.
+"""
 
 import argparse
 from pkgutil import resolve_name
@@ -7,7 +9,7 @@ from visthrow.common.arguments import add_table
 from visthrow.common.toml_text import tables_beside
 
 TABLES = tables_beside(__file__, "commands.toml")
-"""Groups of arguments: those of an action bear its name."""
+"""Groups of arguments; the group of an action has its name."""
 
 FLIES = ("run", "record", "calibrate")
 
@@ -16,7 +18,7 @@ FUNCTIONS = dict.fromkeys(FLIES, "hil.run_command:fly") | {
     "replay": "hil.control.recording.playback:compare_run",
     "view": "hil.control.recording.view:run",
 }
-"""Action -> the function that does it."""
+"""Action -> the function that runs it."""
 
 EXAMPLES = """
   visthrow hil run                              dry run: poses on udp port 14560, nothing is sent
@@ -59,5 +61,5 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the chosen action and return the exit status."""
+    """Run the chosen action and return the exit status."""
     return resolve_name(FUNCTIONS[args.action])(args)

@@ -98,8 +98,8 @@ class FakeOptions(Bounded):
 
 
 class SetPoints:
-    """Set-points that begin to act at any time, flown by a plant in periods of its own: those that
-    came, and from when on they act.
+    """A queue of set-points with the times from which they act, sampled by a plant with its own
+    period.
     """
 
     def __init__(self) -> None:
@@ -107,19 +107,19 @@ class SetPoints:
         self._coming: deque[tuple[float, ndarray]] = deque()
 
     def add(self, when: float, target: ndarray) -> None:
-        """Take a set-point, thrust [N] and body rates [rad/s], that acts from a time on [s], later
-        than those before.
+        """Add a set-point, thrust [N] and body rates [rad/s], that acts from a time on [s],
+        later than the earlier ones.
         """
         self._coming.append((when, target))
 
     def forget(self) -> None:
-        """Forget what came so far."""
+        """Delete all set-points."""
         self._acting = None
         self._coming.clear()
 
     def compute_command(self, begin: float, period: float) -> ndarray | None:
-        """Return what acts in the period from a time on [s]: the mean, where it changes within it;
-        None before the first one.
+        """Return the mean set-point over the period from a time on [s]; None before the first
+        set-point.
         """
         mean = np.zeros(4)
         since = begin
@@ -138,14 +138,14 @@ class SetPoints:
 
 @dataclass
 class Witness:
-    """Notes what must never arrive at a vehicle, from the vehicle's side.
+    """A monitor on the vehicle's side that records commands that must never arrive.
 
     Attributes:
         limits: largest thrust [N] and body rates [rad/s] that may be asked for.
         fence: corners of the box that the payload may be released in [m], world frame.
         breaches: what happened, with its time; empty after a good run.
-        commands, releases: how many came.
-        worst: largest sizes that came, of thrust [N] and rates [rad/s].
+        commands, releases: numbers received. worst: largest magnitudes received, of thrust [N] and
+            rates [rad/s].
     """
 
     limits: tuple[float, float, float, float]
@@ -160,7 +160,7 @@ class Witness:
     _answered: bool = False
 
     def command(self, time: float, command: tuple[float, ...]) -> None:
-        """Note a set-point: thrust [N], body rates [rad/s]."""
+        """Check a set-point: thrust [N], body rates [rad/s]."""
         self.commands += 1
         if not all(map(math.isfinite, command)):
             self._note(time, f"command {command} is not finite")
@@ -170,7 +170,7 @@ class Witness:
             self._note(time, f"command {command} beyond {self.limits}")
 
     def release(self, time: float, armed: bool, payload_w: ndarray) -> None:
-        """Note a command to open the mechanism."""
+        """Check a command to open the mechanism."""
         self.releases += 1
         low, high = self.fence
         if self._answered:
@@ -185,7 +185,7 @@ class Witness:
             )
 
     def note_answer(self) -> None:
-        """Note that the release was acknowledged: none may follow."""
+        """Record that the release was acknowledged: none may follow."""
         self._answered = True
 
     def _note(self, time: float, text: str) -> None:
@@ -194,7 +194,8 @@ class Witness:
 
 
 class Fake(ABC):
-    """The vehicle and the motion capture of both bodies; the children add an autopilot's protocol.
+    """A simulated vehicle with motion capture of both bodies; subclasses add an autopilot's
+    protocol.
 
     Attributes:
         last_thrust: of the last period [N]. wall: the time now, within a period as well [s].
@@ -262,7 +263,7 @@ class Fake(ABC):
 
     @staticmethod
     def open_port(number: int) -> Port | None:
-        """Open a port for commands; None: they come on the link of the poses."""
+        """Open a port for commands; None if they arrive on the link of the poses."""
         return None
 
     def note_event(self, text: str) -> None:
@@ -275,7 +276,7 @@ class Fake(ABC):
             self.events.append((round(self.plant.time, 3), text))
 
     def later(self, delay: float, what: Callable[[], None]) -> None:
-        """Do something after a delay [s]; at once, still within this period, where it is 0."""
+        """Call a function after a delay [s]; at once if the delay is 0."""
         if delay <= 0.0:
             what()
             return
@@ -306,11 +307,11 @@ class Fake(ABC):
         self._set_points.add(self.heard + delay, np.nan_to_num(np.array(command)))
 
     def stay(self) -> None:
-        """Hold this place from now on."""
+        """Hold the current position from now on."""
         self._place = self.plant.state["pos_w"].astype(float)
 
     def forget(self) -> None:
-        """Follow no set-point that came before: another one flies from now on."""
+        """Discard earlier set-points, because somebody else flies from now on."""
         self._target = None
         self._set_points.forget()
 
@@ -327,7 +328,7 @@ class Fake(ABC):
         return self.release_time is not None and self.plant.time >= self.release_time
 
     def note_release(self) -> None:
-        """Note that a release command has come."""
+        """Record that a release command has arrived."""
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def output(self, is_open: bool, when: float) -> bool:
@@ -346,7 +347,7 @@ class Fake(ABC):
         return opens
 
     def weight(self) -> float:
-        """Return the weight of what flies now [N]."""
+        """Return the flying weight [N]."""
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: ndarray) -> ndarray:
@@ -365,21 +366,21 @@ class Fake(ABC):
 
     @abstractmethod
     def take(self) -> None:
-        """Let the pilot take the vehicle over, and hold it."""
+        """Let the pilot take the vehicle over and hold its position."""
 
     @abstractmethod
     def compute_command(self) -> ndarray:
-        """Return the command of this period, by whoever flies."""
+        """Return the command of this period, from whoever is in control."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
         """Say what is due: heartbeats, streams."""
 
     def hear(self) -> None:
-        """Take in what has come."""
+        """Process received messages."""
         self.link.pump(self.wall)
 
     def deliver(self, time: float) -> None:
-        """Do what was put off until a time [s]."""
+        """Call the functions that are due by a time [s]."""
         while self._later and self._later[0][0] <= time + SLACK:
             heapq.heappop(self._later)[2]()
 
@@ -389,7 +390,7 @@ class Fake(ABC):
         """
 
     def fly(self) -> None:
-        """Hear what has come, and fly one period."""
+        """Process received messages, and fly one period."""
         plant = self.plant
         self.hear()
         self.deliver(plant.time)
@@ -472,13 +473,13 @@ class Fake(ABC):
         }
 
     def close(self) -> None:
-        """Give the ports back."""
+        """Close the ports."""
         self.link.close()
 
 
 class Bridge(Fake):
-    """A real autopilot in software flies; it speaks for itself, and the runner's link passes this
-    process by.
+    """A plant flown by a real autopilot in software, which communicates with the runner
+    directly.
     """
 
     params: Any  # of the back-end: which output or channel opens the mechanism

@@ -2,5 +2,5 @@
 
 MAVLink, .tlog, .BIN, .ulg, CSV, motion-capture systems.
 
-A source hands on raw poses, in its own frames; `hil.poses.frames` converts them.
+A source delivers raw poses in its own frames; `hil.poses.frames` converts them.
 """

@@ -1,9 +1,9 @@
-"""Frames of the package motioncapture, as a process of its own writes them.
+"""Frames of the package motioncapture, written by a separate process.
 
-The package's libraries wait in C++, and read what comes without looking at its length: what ends
-them ends this process, and not the run. ``python capture.py SYSTEM OPTIONS NAMES``, the last two as
-JSON, writes what :func:`listen` puts on standard output, as JSON, a line each. It imports nothing
-but the standard library.
+The package's C++ libraries block, and do not check the length of received data. If they crash, they
+end this process but not the run. ``python capture.py SYSTEM OPTIONS NAMES``, the last two as JSON,
+writes what :func:`listen` puts on standard output, as JSON, a line each. It imports nothing but the
+standard library.
 
 Source: Linux, filter.rst (classic BPF on sockets) and SO_MEMINFO."""
 
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 PAUSE = 1e-3  # after a frame that raised [s]
-LOOK = 0.5  # between two looks for sockets that the package has opened [s]
+LOOK = 0.5  # between two searches for sockets that the package has opened [s]
 
 PR_SET_PDEATHSIG = 1
 SO_ATTACH_FILTER = 26
@@ -36,8 +36,8 @@ Put = Callable[[Any], None]
 
 
 class Strangers:
-    """Keeps datagrams of other senders than the host from the sockets of this process, in the
-    kernel, and counts them.
+    """A kernel filter that keeps datagrams of senders other than the host from the sockets of
+    this process, and counts them.
     """
 
     def __init__(self, host: str):
@@ -57,7 +57,7 @@ class Strangers:
         self._count = 0
 
     def look(self) -> int:
-        """Put the filter on new sockets, every now and then; returns the datagrams that were
+        """Attach the filter to new sockets from time to time; return the number of datagrams
         refused since the last call.
         """
         if time.monotonic() - self._looked < LOOK:
@@ -82,7 +82,7 @@ class Strangers:
 
 
 def _count_dropped(sock: socket.socket) -> int:
-    """Return the datagrams that the kernel has not handed to a socket."""
+    """Return the number of datagrams that the kernel dropped for a socket."""
     memory = sock.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * (DROPS + 1))
     return struct.unpack_from("I", memory, 4 * DROPS)[0]
 
@@ -133,7 +133,7 @@ def _numbers(body: Any) -> list[float]:
 
 
 def main() -> None:
-    """Listen for the parent, and end with it."""
+    """Listen on behalf of the parent process, and end with it."""
     system, options, names = sys.argv[1], *map(json.loads, sys.argv[2:4])
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what the package prints is none of ours

@@ -1,9 +1,8 @@
-"""Pictures of a real camera as a source of keypoints: a folder, a video or a live camera, looked at
+"""Source of keypoints from a real camera's pictures: a folder, a video or a live camera, processed
 by one of `camera.detectors`.
 
 Times of recorded pictures are on the clock of the recorded poses, counted from their first arrival.
-Frames wait for no tick: of those that have come the newest is looked at, live ones in a thread of
-their own."""
+Only the newest frame that has arrived is processed; a live camera has a separate thread."""
 
 import csv
 import math
@@ -37,7 +36,7 @@ STAMPS = "stamps.csv"
 """
 
 DETECTORS: dict[str, type[Detector]] = {"contours": Detector, "learnt": LearntDetector}
-"""Name -> what looks at a picture. A program adds its own before it calls `visthrow.cli.main`."""
+"""Name -> detector class. A program adds its own before it calls `visthrow.cli.main`."""
 
 # between the lens of the pictures and that of training [m]: directions of near things would differ
 # by more than a degree
@@ -46,16 +45,16 @@ SAME_PLACE = 0.01
 
 @dataclass(frozen=True)
 class ImageParams(Bounded):
-    """The source of pictures, and its camera."""
+    """Parameters of the source of pictures and its camera."""
 
     kind: Literal["folder", "video", "camera"]
     path: str | None = None  # of the folder or video
     device: int = 0  # number of a live camera
     # from the exposure to the arrival of a picture [s]
     delay: Annotated[float, Bound(0.0, 0.5)] = 0.0
-    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts [s]
-    fisheye: FisheyeParams | None = None  # the lens; left out, that of training
-    mount: MountParams | None = None  # left out, that of training
+    hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture is used [s]
+    fisheye: FisheyeParams | None = None  # lens of the pictures; None: that of training
+    mount: MountParams | None = None  # None: that of training
     detector: DetectorParams = field(default_factory=DetectorParams)
     # of DETECTORS: colour and shape with OpenCV, the learnt networks, or one that a program added
     by: str = "contours"
@@ -68,7 +67,7 @@ class ImageParams(Bounded):
 
 @dataclass(frozen=True)
 class Hint:
-    """The runner's knowledge at the time of a picture, in our frames."""
+    """The runner's estimate at the time of a picture, in our frames."""
 
     pos_w: Vector  # of the vehicle [m]
     quat: Quaternion  # body to world, xyzw
@@ -76,13 +75,13 @@ class Hint:
 
 
 class Eyes:
-    """A source of detections; ``hint``: what is known now."""
+    """A source of detections; ``hint``: the runner's current estimate."""
 
     hint: Hint | None = None
 
     def __init__(self, params: ImageParams, training: CameraParams):
-        """Take lens and mount of the pictures; raises `ConfigError` for an unknown detector, or a
-        lens that is not at training's place.
+        """Set lens and mount of the pictures. Raises `ConfigError`: the detector is unknown, or
+        the lens is not where it was in training.
         """
         if params.by not in DETECTORS:
             raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
@@ -106,8 +105,8 @@ class Eyes:
         self._followed = BallGoalTracker(training.payload_radius, training.goal_side)
 
     def look(self, picture: ndarray, stamp: float) -> Detection:
-        """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
-        another size.
+        """Detect ball and goal in a picture, BGR, uint8, exposed at a time [s]. Raises
+        `SourceError`: the picture has another size.
         """
         prior = Prior()
         rot_wc = None
@@ -136,20 +135,20 @@ class Eyes:
         return Detection(stamp, corners, ball)
 
     def poll(self, time: float) -> list[Detection]:
-        """Return detections that have come by a time [s]; never waits."""
+        """Return the detections that have arrived by a time [s]; never waits."""
         raise NotImplementedError
 
     def close(self) -> None:
-        """Give the camera back."""
+        """Close the camera."""
 
 
 class RecordedImages(Eyes):
-    """Pictures of a folder or a video, each looked at when the runner's clock has reached its
+    """Pictures of a folder or a video, each processed when the runner's clock reaches its
     arrival.
     """
 
     def __init__(self, params: ImageParams, training: CameraParams):
-        """Read the time stamps; raises `SourceError` for no pictures, no stamps, or a video that
+        """Read the time stamps. Raises `SourceError`: no pictures, no stamps, or a video that
         cannot be opened.
         """
         super().__init__(params, training)
@@ -172,8 +171,8 @@ class RecordedImages(Eyes):
 
 
 class LiveImages(Eyes):
-    """A camera, read and looked at in a thread of its own; ``failure`` is what ended it, and the
-    keypoints go stale then.
+    """A live camera, read and processed in a separate thread; ``failure`` is the error that
+    ended it, after which the keypoints go stale.
     """
 
     def __init__(
@@ -226,7 +225,7 @@ class LiveImages(Eyes):
 
 
 def open_images(params: ImageParams, training: CameraParams, clock: Callable[[], float]) -> Eyes:
-    """Open pictures; see the classes for what is refused."""
+    """Open the source of pictures; see the classes for the errors."""
     return (
         LiveImages(params, training, clock)
         if params.kind == "camera"

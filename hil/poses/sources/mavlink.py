@@ -1,5 +1,5 @@
-"""Poses from MAVLink messages, over a link or out of a .tlog (see ``hil.poses.sources.player``):
-one decoder for both.
+"""Poses from MAVLink messages of a link or a .tlog (see ``hil.poses.sources.player``), with one
+decoder for both.
 """
 
 from collections.abc import Callable
@@ -22,18 +22,18 @@ from visthrow.config.bounds import Bound, Bounded
 
 ATTITUDES = ("ATTITUDE_QUATERNION", "ATTITUDE")
 COMPANIONS = {"LOCAL_POSITION_NED": ("LOCAL_POSITION_NED", *ATTITUDES)}
-"""Messages that make up a pose, where it is more than one."""
+"""Messages that form a pose together, if it needs more than one."""
 
 Drop = Callable[[Any, str], None]
-"""Takes a message of a body that is no pose, and why."""
+"""Function that receives a body's message that is not a pose, and the reason."""
 
-# an attitude older than this against the position that it is to be paired with is none [s]
+# largest age of an attitude that is paired with a position [s]
 PAIR_AGE = 0.05
 
 
 @dataclass(frozen=True)
 class BodyIds(Bounded):
-    """Which sender speaks of which body, and in which message."""
+    """The sender and the message of one body's poses."""
 
     body: Body
     # LOCAL_POSITION_NED is paired with ATTITUDE_QUATERNION or ATTITUDE.
@@ -43,7 +43,7 @@ class BodyIds(Bounded):
 
 
 class MavlinkDecoder:
-    """Messages to poses; bodies told apart by their senders."""
+    """A decoder of MAVLink messages to poses; senders identify the bodies."""
 
     def __init__(self, bodies: tuple[BodyIds, ...], drop: Drop = lambda message, why: None):
         """Take the senders; raises `SourceError` for none, or the same sender and message for two
@@ -82,7 +82,7 @@ class MavlinkDecoder:
         return None
 
     def _objection(self, message: Any, paired: bool) -> str:
-        """Return why a message of a body is no pose."""
+        """Return why a body's message is not a pose."""
         if paired:
             return f"no {' or '.join(ATTITUDES)} within {1e3 * PAIR_AGE:g} ms of it"
         accepted = " or ".join(map(frame_name, LOCAL_FRAMES))
@@ -110,7 +110,7 @@ class MavlinkDecoder:
 
 
 FORMER_FRAMES = dict(enumerate(["MOCAP_NED", "MOCAP_ENU", "VISION_NED", "VISION_ENU"], start=14))
-"""MAV_FRAMEs of before 2019, which MAVLink only reserves today."""
+"""MAV_FRAMEs from before 2019, which MAVLink now reserves."""
 
 
 def frame_name(number: int) -> str:
@@ -121,7 +121,7 @@ def frame_name(number: int) -> str:
 
 
 def traffic_of(message: Any, address: Address, why: str) -> Traffic:
-    """Return how a message that is not taken is counted."""
+    """Return the key by which a refused message is counted."""
     ids = message.get_srcSystem(), message.get_srcComponent()
     return Traffic(address, *ids, message.get_type(), why)
 

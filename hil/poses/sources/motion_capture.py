@@ -2,10 +2,10 @@
 
 ``motioncapture`` (Vicon, OptiTrack, Qualisys, VRPN, ...) and ``natnet`` (Motive).
 
-Both packages wait for frames, so each is listened to in a thread of its own, which notes the
-arrival and hands the poses over; polling never waits. What cannot be read is dropped, counted and
-said once with its sender; no datagram and no frame ends a thread. Axes are those of the system:
-Vicon and Qualisys z up, OptiTrack y up; quaternions are xyzw."""
+Both packages block until a frame arrives. So a separate thread reads each of them, records the
+arrival and queues the poses; polling never waits. Invalid data is dropped, counted and reported
+once with its sender; no datagram or frame ends a thread. Axes are those of the system: Vicon and
+Qualisys z up, OptiTrack y up; quaternions are xyzw."""
 
 import functools
 import importlib.util
@@ -34,16 +34,16 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
 from visthrow.config.bounds import Bounded, Positive
 
-MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
+MOST_WAITING = 2000  # most poses kept between two polls; older ones are dropped
 
 HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
 # messages
 SERVER_INFO = 1
 FRAME = 7
-IGNORED = (1, 3, 5, 8, 100)  # those that are passed over
-RESTART_DELAY = 1.0  # after which a capture that has ended is started again, on the ground [s]
-QUIET = 5.0  # without a frame, after which it is started again on the ground: it may hang [s]
-ENDING = 2.0  # that threads and processes are given to end [s]
+IGNORED = (1, 3, 5, 8, 100)  # ignored
+RESTART_DELAY = 1.0  # before a capture that has ended is restarted, on the ground [s]
+QUIET = 5.0  # time without a frame after which it is restarted on the ground: it may hang [s]
+ENDING = 2.0  # longest wait for threads and processes to end [s]
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class MocapSource(Source):
         raise NotImplementedError
 
     def hand_over(self, pose: Pose) -> None:
-        """Take a pose; from any thread."""
+        """Queue a pose; callable from any thread."""
         self._waiting.append(pose)
 
     def poll(self, time: float) -> list[Pose]:
@@ -185,7 +185,7 @@ class MotionCaptureSource(MocapSource):
                 pass
 
     def _say(self, text: str) -> None:
-        """Say a line, once where nothing else was said since."""
+        """Report a line, unless it was the last one reported."""
         if text != self._said:
             self._said = text
             self._tell(text)
@@ -235,7 +235,7 @@ class MotionCaptureSource(MocapSource):
         raise SourceError(lines[-1] if lines and status > 0 else f"its process ended with {status}")
 
     def _take(self, value: Any) -> None:
-        """Take what `hil.poses.sources.capture.listen` puts."""
+        """Process an item of `hil.poses.sources.capture.listen`."""
         arrival = self._clock()
         host = (self._params.host, 0)
         if value is None:

@@ -1,4 +1,4 @@
-"""Opens the source that a config names."""
+"""Opening of the source that a config names."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -45,9 +45,7 @@ def read_poses(params: HilParams, roster: Roster | None = None) -> list[Pose]:
 
 
 def parties(params: HilParams, poses: bool, autopilot: bool) -> list[Party]:
-    """Return who may speak on a link that carries MAVLink poses, or the autopilot where that speaks
-    MAVLink, or both.
-    """
+    """Return the parties of a link that carries MAVLink poses, a MAVLink autopilot, or both."""
     bodies = []
     if poses:
         for ids in params.source.senders:
@@ -140,7 +138,7 @@ def open_mocap(
 SENDER = (  # of a port that is taken
     "and that port in what sends the poses (visthrow hil fake --device udpout:127.0.0.1:PORT)"
 )
-FEWEST_POSES = 50  # poses below which nothing is said
+FEWEST_POSES = 50  # least poses for a judgement
 _KINDS = {
     "pos": ("m", "world"),
     "quat": ("1", "world"),
@@ -150,8 +148,8 @@ _KINDS = {
 
 
 def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list[str]:
-    """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says
-    which unit would make sense of it.
+    """Return texts on physically impossible motion in a recording's raw poses, by the frames of
+    each body; each text names a unit that would explain it.
     """
     poses = list(poses)
     channels = {}
@@ -167,7 +165,9 @@ def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list
 
 
 def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict[str, Channel]:
-    """Return poses of one body as channels in our frames; what some of them lack is left out."""
+    """Return poses of one body as channels in our frames; channels that some poses lack are left
+    out.
+    """
     ours = [
         frames.pose_from_source(p)
         for p in poses
