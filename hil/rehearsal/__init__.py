@@ -1,3 +1,3 @@
-"""Fake autopilots that behave over the wire as the real ones were measured to; what flies behind
+"""Fake autopilots whose messages and timing follow measurements of real ones; the plant behind
 them is injected.
 """

@@ -1,5 +1,5 @@
-"""What all fakes share: plant, motion capture on the wire, a queue of things that take their time,
-a hold of their own.
+"""The common part of all fakes: plant, motion capture over the link, a queue of delayed actions,
+a hold mode.
 """
 
 import heapq
@@ -31,16 +31,16 @@ MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were train
 
 NEVER = 1e9  # a time after every flight [s]
 MOST_EVENTS = 200
-ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
-MOST_KEPT = 100  # breaches
-ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
+ROOM = 1.01  # tolerance of a limit: whole microseconds of a stick, float32 in messages
+MOST_KEPT = 100  # breaches kept
+ANNOUNCED = 1.0  # between two messages that nothing real flies, which `--auto-arm` requires [s]
 # set-point of a landing below the vehicle, and at least; height that counts as down [m]
 DESCENT = 0.4
 LOWEST = 0.05
 TOUCH = 0.12
 # of the policy's vehicle: weight [N], its share of 14 N, straight, tolerance, no voltage
 THRUST = HoverThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
-GOES_ON = 1.5  # periods after which an event that comes again is a new one
+GOES_ON = 1.5  # periods after which a repeated event is a new one
 COVARIANCES = 21  # numbers of a covariance in ODOMETRY
 
 
@@ -88,7 +88,7 @@ class FakeOptions(Bounded):
     # [s]
     mechanism: NotNegative = 0.0
     clock_offset: float = 0.0  # of its clock [s]
-    silent_after: float = NEVER  # it says nothing any more from this time on [s]
+    silent_after: float = NEVER  # it sends nothing from this time on [s]
     taken_after: float = NEVER  # when the pilot takes the vehicle over [s]
     # ODOMETRY carries a reset counter
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"
@@ -222,8 +222,8 @@ class Fake(ABC):
         options: FakeOptions | None = None,
         port: Port | None = None,
     ):
-        """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands
-        come by the port, or on the link.
+        """Start under a pilot's control. Poses are sent on the link with the vehicle's ids;
+        commands arrive at the port, or on the link.
         """
         self.plant = plant
         self.link = link
@@ -245,14 +245,14 @@ class Fake(ABC):
         self._count = 0
         self.armed = self.options.armed
         self._place = np.array(plant.home_w, dtype=float)
-        self._target: ndarray | None = None  # of the set-points that act in this period
+        self._target: ndarray | None = None  # set-point that acts in this period
         self._last_command = float("-inf")  # when the last set-point was followed [s]
         self._trip: float | None = None  # when the latch of the plant trips [s]
         self.followed = self.ignored = 0
         self.release_time: float | None = None
         self.last_thrust = 0.0
         self.wall: Callable[[], float] = lambda: self.plant.time
-        self.heard = 0.0  # when the message that is being taken came [s]
+        self.heard = 0.0  # arrival of the message that is being processed [s]
         # In lock step an answer is heard a period after its question: this makes the question come
         # in the middle [s].
         self.question_lag = 0.5 * plant.period
@@ -267,8 +267,8 @@ class Fake(ABC):
         return None
 
     def note_event(self, text: str) -> None:
-        """Note something that the autopilot did by itself, or was commanded; what goes on from one
-        period to the next is one event.
+        """Record an action of the autopilot, its own or commanded; an action that continues in
+        the next period is one event.
         """
         goes_on = self.plant.time - self._going_on.get(text, -1e9) < GOES_ON * self.plant.period
         self._going_on[text] = self.plant.time
@@ -293,8 +293,8 @@ class Fake(ABC):
         return self.plant.time >= self.options.silent_after
 
     def set_point(self, command: tuple[float, ...], listens: bool) -> None:
-        """Take a set-point that was just heard, thrust [N] and body rates [rad/s], and follow it or
-        not; what is no number is 0.
+        """Process a received set-point, thrust [N] and body rates [rad/s]; ``listens``: whether
+        it is followed. Values that are not finite become 0.
         """
         self.witness.command(self.plant.time, command)
         if not listens:
@@ -316,7 +316,9 @@ class Fake(ABC):
         self._set_points.forget()
 
     def open_mechanism(self) -> None:
-        """Move the output; what hangs on it lets go some time later. With "accepted" alone."""
+        """Move the mechanism's output, with the option "accepted" only; the payload separates
+        some time later.
+        """
         if self.options.answer != "accepted" or self.release_time is not None:
             return
         self.release_time = self.heard + self.options.servo_delay
@@ -332,8 +334,8 @@ class Fake(ABC):
         self.witness.release(self.plant.time, self.armed, self.plant.state["payload_pos_w"])
 
     def output(self, is_open: bool, when: float) -> bool:
-        """Take the mechanism's output, or its channel, as seen at a time [s]; whether it has opened
-        now, which releases. One that was never seen closed holds what was hung on.
+        """Process the mechanism's output, or its channel, at a time [s]; return whether it has
+        opened now, which releases the payload. An output that was never closed does not release.
         """
         opens = is_open and self._open is False
         if is_open and self._open is None:
@@ -351,7 +353,7 @@ class Fake(ABC):
         return self.plant.mass[0 if self.plant.state["attached"] else 1] * GRAVITY
 
     def hold(self, goal_w: ndarray) -> ndarray:
-        """Return the command that holds a place [m]: of the autopilot, or of the pilot's hands."""
+        """Return the command that holds a position [m], for the autopilot or the pilot."""
         state = self.plant.state
         views = [state[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
         return self._hover.step(*views, goal_w, self.weight() / GRAVITY)[0]
@@ -373,7 +375,7 @@ class Fake(ABC):
         """Return the command of this period, from whoever is in control."""
 
     def speak(self) -> None:  # noqa: B027 - one that speaks when it is asked says nothing here
-        """Say what is due: heartbeats, streams."""
+        """Send what is due: heartbeats, streams."""
 
     def hear(self) -> None:
         """Process received messages."""
@@ -385,8 +387,8 @@ class Fake(ABC):
             heapq.heappop(self._later)[2]()
 
     def run_on(self, when: float) -> None:  # noqa: B027  most fakes have no clock of their own
-        """Let the autopilot work up to a time within this period [s], where its clock is ours: what
-        comes then was not there before.
+        """Let the autopilot run up to a time within this period [s], if its clock is ours;
+        messages of that time do not act earlier.
         """
 
     def fly(self) -> None:
@@ -426,7 +428,7 @@ class Fake(ABC):
         self.emit()
 
     def _post(self, pose: Pose) -> None:
-        """Put a pose, as the source writes it, on its way."""
+        """Send a pose in the source's convention."""
         stamp = int((pose.stamp + self.options.clock_offset) * 1e6)
         if self.options.pose_message == "ODOMETRY":
             unknown = [float("nan")] * 3

@@ -1,10 +1,10 @@
 """A fake ArduCopter.
 
 It follows SET_ATTITUDE_TARGET only in GUIDED or GUIDED_NOGPS, armed, for its own system id and with
-a type mask of 128 alone, and ignores all else without a word; it takes a NaN thrust and falls;
-without bit 3 of GUID_OPTIONS thrust is a climb rate; with ATC_ANGLE_BOOST it grows with tilt;
-silence of GUID_TIMEOUT levels it; DO_SET_SERVO is accepted on an output that has a function, and
-moves nothing. Until the first command it holds its place."""
+a type mask of exactly 128, and silently ignores all other set-points. It accepts a NaN thrust and
+falls. Without bit 3 of GUID_OPTIONS thrust is a climb rate; with ATC_ANGLE_BOOST it grows with
+tilt. After GUID_TIMEOUT without set-points it levels. DO_SET_SERVO is accepted for an output that
+has a function, but moves nothing. Until the first command it holds its position."""
 
 from typing import Any
 
@@ -32,7 +32,7 @@ ANSWERS = {"denied": mav.MAV_RESULT_DENIED, "in-progress": mav.MAV_RESULT_IN_PRO
 
 
 class FakeArduPilot(FakeMavlink):
-    """See the head of this module."""
+    """A fake ArduCopter; see the module's docstring."""
 
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     modes = (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE)
@@ -81,7 +81,7 @@ class FakeArduPilot(FakeMavlink):
         return self._interpret(self._target)
 
     def _interpret(self, target: ndarray) -> ndarray:
-        """Return the set-point as the parameters make it mean."""
+        """Return the set-point as interpreted with the parameters."""
         out = target.copy()
         state = self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:

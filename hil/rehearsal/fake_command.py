@@ -1,4 +1,4 @@
-"""``visthrow hil fake``: the simulated vehicle over the wire, and behind a firmware in software."""
+"""``visthrow hil fake``: a simulated vehicle behind a fake autopilot or a firmware in software."""
 
 import argparse
 import json

@@ -1,5 +1,5 @@
-"""What the fakes of ArduPilot and PX4 share: commands and their answers, parameters, TIMESYNC,
-heartbeats, streams.
+"""The common part of the fakes of ArduPilot and PX4: commands and their answers, parameters,
+TIMESYNC, heartbeats, streams.
 """
 
 from abc import abstractmethod
@@ -21,7 +21,7 @@ SERVO = 9  # output of the mechanism, from 1
 
 
 class FakeMavlink(Fake):
-    """An autopilot on the poses' link."""
+    """A fake autopilot on the poses' link."""
 
     autopilot = mav.MAV_AUTOPILOT_GENERIC
     modes: tuple[int, ...]  # custom modes that it can be in
@@ -62,7 +62,7 @@ class FakeMavlink(Fake):
         """Ends of the mechanism's output, closed and open [us]."""
 
     def beat_soon(self) -> None:
-        """Say that mode or arming have changed, where it is prompt with that."""
+        """Send a heartbeat after a change of mode or arming, if the autopilot does so at once."""
         if self.usually_prompt if self.options.prompt is None else self.options.prompt:
             self._next_beat = 0.0
 
@@ -96,7 +96,7 @@ class FakeMavlink(Fake):
         self.beat_soon()
 
     def enter(self, mode: int) -> int:
-        """Enter a custom mode; the result of the command."""
+        """Enter a custom mode; return the result of the command."""
         if mode not in self.modes:
             return mav.MAV_RESULT_DENIED
         if mode != self.mode:
@@ -108,7 +108,7 @@ class FakeMavlink(Fake):
         return mav.MAV_RESULT_ACCEPTED
 
     def mode_text(self, mode: int) -> str:
-        """Return a custom mode as people write it."""
+        """Return a custom mode as text."""
         return str(mode)
 
     def _command(self, message: Any) -> None:
@@ -145,7 +145,7 @@ class FakeMavlink(Fake):
 
     @abstractmethod
     def answer_release(self, message: Any) -> None:
-        """Answer and do it, each as the options say."""
+        """Answer a release command and execute it, as the options state."""
 
     def _arm(self, message: Any) -> None:
         wanted = message.param1 == 1.0
@@ -197,7 +197,7 @@ class FakeMavlink(Fake):
                 self._stream(number)
 
     def _stream(self, number: int) -> None:
-        """Send one of the messages that are said by themselves or were asked for."""
+        """Send a message of a default or requested stream."""
         boot = int(self.clock() * 1e3) & 0xFFFFFFFF
         if number == mav.MAVLINK_MSG_ID_HEARTBEAT:
             flags = CUSTOM | (ARMED if self.armed else 0)

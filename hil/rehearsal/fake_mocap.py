@@ -1,7 +1,7 @@
-"""What a motion-capture system makes of the truth: rate, noise, latency and loss, from a seed.
+"""A model of a motion-capture system: rate, noise, latency and loss, from a seed.
 
-The fake autopilot sends these poses over the wire; the same seed gives a throw flown in the
-simulator directly the same ones."""
+The fake autopilot sends these poses over the link; with the same seed, a throw flown directly in
+the simulator gets the same poses."""
 
 import math
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ SLACK = 1e-9  # tolerance of times that are sums of periods [s]
 
 @dataclass(frozen=True)
 class FakeMocapParams(Bounded):
-    """The motion capture's measurement of the true poses."""
+    """Parameters of the motion capture."""
 
     rate: Positive = 100.0  # poses a second of each body [Hz]
     position_noise: NotNegative = 1e-3  # standard deviation [m]
     angle_noise_deg: NotNegative = 0.2  # standard deviation about each axis
     latency: NotNegative = 0.01  # from the instant of a pose to its sending [s]
-    loss: Annotated[float, Bound(0.0, 1.0, "[)")] = 0.02  # share of poses that never come
+    loss: Annotated[float, Bound(0.0, 1.0, "[)")] = 0.02  # share of poses that are lost
 
 
 class Mocap:
-    """Measures vehicle and payload."""
+    """A motion-capture system that measures vehicle and payload."""
 
     def __init__(self, params: FakeMocapParams, seed: int):
-        """Begin with a measurement at time 0; ``seed``: of noise and loss."""
+        """Start with a measurement at time 0; ``seed``: of noise and loss."""
         self.params = params
         self._rng = np.random.default_rng(seed)
         self._next = 0.0

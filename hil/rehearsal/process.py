@@ -60,13 +60,13 @@ def serve(fake: Fake, clock: Clock, limit: float, out: Path | None, after: float
     plant = fake.plant
     begun = fake.plant.time
     late = 0
-    # where the machine is late the vehicle's clock is as late as the vehicle
+    # if the machine is late, the vehicle's clock is late by the same time
     start = clock.now() - begun
     heard: list[tuple[float, float]] = []  # first and last period on a firmware's clock
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
     interrupt = StopRequest((signal.SIGINT,))
-    # a collection of all takes a tenth of a second
+    # a full garbage collection takes a tenth of a second
     with contextlib.suppress(KeyboardInterrupt), interrupt as stop, pause_garbage_collection():
         while plant.time - begun < limit and not stop.asked:
             time = plant.time + plant.period
@@ -76,10 +76,10 @@ def serve(fake: Fake, clock: Clock, limit: float, out: Path | None, after: float
                 due = -math.inf
                 heard = [*heard[:1], (clock.now(), plant.time)]
             late += math.isfinite(due) and clock.now() > due
-            while clock.now() < due:  # what comes meanwhile acts from when it comes
+            while clock.now() < due:  # messages act from their arrival
                 clock.wait_for([fake.port], due)
                 fake.hear()
-            fake.deliver(time)  # poses leave before a period is worked out
+            fake.deliver(time)  # poses are sent before a period is computed
             fake.step()
             landed = plant.landing["landing_time"]
             if landed is not None and plant.time > landed + after:

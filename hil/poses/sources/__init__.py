@@ -1,4 +1,4 @@
-"""Sources of poses behind one face, live and replayed alike:
+"""Sources of poses with a common interface, live and recorded:
 
 MAVLink, .tlog, .BIN, .ulg, CSV, motion-capture systems.
 

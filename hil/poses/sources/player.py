@@ -1,4 +1,4 @@
-"""Poses of recordings: of flight logs, by their channels, and of .tlog files, by the decoder of the
+"""Poses from recordings: flight logs, by their channels, and .tlog files, by the decoder of the
 live link.
 
 ``visthrow.logs`` reads all files. Poses of an autopilot's log keep its axes, world north, east,
@@ -42,7 +42,7 @@ class LogBody(Bounded):
     body: Body
     message: str  # one of `visthrow.logs.readers.autopilot_logs.pose_messages`
     instance: Annotated[int, Bound(0)] = 0  # core of XKF1; instance of a ULog topic
-    file: str | None = None  # of a logger of its own, say on the payload; else the source's file
+    file: str | None = None  # of a separate logger, as on the payload; None: the source's file
     time_offset: float = 0.0  # added to this log's times [s]: loggers do not share a clock
 
 
@@ -75,7 +75,7 @@ def read_table(path: str | Path, mapping: TableMap | None) -> list[Pose]:
 
 
 def _poses_of_channels(log: FlightLog, body: str) -> list[Pose]:
-    """Return poses of one body; of a sample that is not valid the numbers are NaN."""
+    """Return poses of one body; the numbers of invalid samples are NaN."""
     position = CHANNELS[body][0]
     if position not in log or not len(log[position].time):
         return []

@@ -1,4 +1,4 @@
-"""Source of poses: what the runner needs of it, and the one that plays recorded poses.
+"""The interface of pose sources, and the source of recorded poses.
 
 Sources raise :class:`hil.errors.SourceError` when they are opened, never when they are polled.
 """
@@ -19,7 +19,7 @@ class Source:
     ``rosters`` say who was heard, and count what was refused.
     """
 
-    ended: bool = False  # nothing will come any more
+    ended: bool = False  # whether no further poses will arrive
     stamped: bool = True  # whether stamps are the source's; else they are arrivals
 
     def __init__(self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0):
@@ -35,8 +35,8 @@ class Source:
         raise NotImplementedError
 
     def wait(self, clock: Clock, until: float) -> None:
-        """Wait until a time [s], taking in what comes in the meantime, so that its arrival is
-        known.
+        """Wait until a time [s], and process arrivals in the meantime, so that their times are
+        recorded.
         """
         while self.links and clock.now() < until:
             clock.wait_for([link.port for link in self.links], until)
@@ -45,24 +45,24 @@ class Source:
         clock.sleep_until(until)
 
     def pump(self) -> int:
-        """Hand on all that has arrived on the links; returns 0 where nothing has."""
+        """Process all arrivals on the links; return 0 if there are none."""
         return sum([link.pump(self._clock) for link in self.links])
 
     def hold(self, flying: bool) -> None:
-        """Say whether the vehicle is ours in flight: then nobody's address on the links
-        may change.
+        """Set whether the runner flies the vehicle; then no sender's address on the links may
+        change.
         """
         for roster in self.rosters:
             roster.flying = flying
 
     def close(self) -> None:
-        """Give ports and files back."""
+        """Close ports and files."""
         for link in self.links:
             link.close()
 
 
 class RecordedSource(Source):
-    """Recorded poses, each handed on when the runner's clock has reached its arrival."""
+    """A source of recorded poses, each delivered when the runner's clock reaches its arrival."""
 
     def __init__(self, poses: Iterable[Pose], roster: Roster | None = None):
         """Sort by arrival; poses that arrived together keep their order. ``roster`` counts what of

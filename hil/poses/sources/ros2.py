@@ -24,7 +24,7 @@ from visthrow.common.extras import load_extra
 
 KINDS = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry", "tf2_msgs/TFMessage")
 
-MOST_TAKEN = 100  # messages of a topic taken in one go
+MOST_TAKEN = 100  # most messages of a topic read in one call
 
 LOOPBACK = """<CycloneDDS><Domain>
 <General>
@@ -189,13 +189,13 @@ class Ros2Source(MocapSource):
         return Listener()
 
     def drop(self, place: str, why: str) -> None:
-        """Count what came on a topic and is no pose."""
+        """Count a message of a topic that is not a pose."""
         self.roster.drop((place, 0), "message", why)
 
     def take(self, message: Any, kind: str, place: str, body: str, frames: str) -> None:
-        """Take a message of a topic; the first publisher of a body's poses is heard, no other."""
+        """Process a message of a topic; only the first publisher of a body's poses is accepted."""
         arrival = self._clock()
-        if not hasattr(message, "__dataclass_fields__"):  # a publisher has come or gone
+        if not hasattr(message, "__dataclass_fields__"):  # a publisher has appeared or disappeared
             return
         try:
             poses = list(read_placements(kind, message, frames))

@@ -1,3 +1,3 @@
-"""Real firmware in software with the simulator's vehicle behind it: its process, its set-up, the
-bridge between the two.
+"""Bridges between real firmware in software and the simulator's vehicle, with the firmware's
+process and set-up.
 """

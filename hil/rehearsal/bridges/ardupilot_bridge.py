@@ -37,7 +37,7 @@ OURS = FACTS["motor_order"]
 
 LOW = 1000.0  # MOT_PWM_MIN [us]
 HIGH = 2000.0  # MOT_PWM_MAX [us]
-ARRIVED = 50.0  # an output this near to its target has arrived [us]
+ARRIVED = 50.0  # tolerance within which an output has reached its target [us]
 # for the next frame of an ArduPilot that was heard [s]; then the plant goes on without it
 PATIENCE = 1.0
 
@@ -45,8 +45,8 @@ FLIP = np.array([1.0, -1.0, -1.0])
 
 
 def outputs(packet: bytes) -> tuple[int, ndarray] | None:
-    """Number of a frame and its servo outputs [us], shape (16,) or (32,); None where the packet
-    holds none.
+    """Return the number of a frame and its servo outputs [us], shape (16,) or (32,); None for an
+    invalid packet.
     """
     if len(packet) < HEAD.size:
         return None
@@ -94,8 +94,8 @@ class ArduPilotSitl(Bridge):
         self.port = UdpPort(Device("udp", "127.0.0.1", SERVOS))
 
     def fly(self) -> None:
-        """Fly a period by the next frame's outputs, and the state after it in answer; without a
-        frame, a period as it was.
+        """Fly a period with the next frame's outputs, and answer with the state after it;
+        without a frame, fly with the last outputs.
         """
         frame = self._frame()
         self.paced = frame is not None

@@ -31,7 +31,7 @@ LOOK_AGAIN = 0.02  # for a port that opens [s]
 START = 20.0  # time for a start [s]
 ANSWER = 20.0  # time for an answer of the command line [s]
 END = 10.0  # time for the process's end [s]
-FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
+FREED = 90.0  # longest wait for a port of the last firmware to be free [s]: TIME_WAIT is 60 s
 
 LOCKSTEP = Path(__file__).with_name("lockstep.c")
 
@@ -43,8 +43,8 @@ PROMPT = b"\n# "
 
 
 def list_settings(params: BetaflightParams) -> dict[str, str]:
-    """Return the settings that a throw needs, by the name or the first words that the command line
-    prints them under.
+    """Return the settings that a throw needs, by the name or first words under which the command
+    line prints them.
     """
     rates = params.rates
     out = tables_beside(__file__, "firmware_settings.toml")
@@ -155,7 +155,7 @@ class Firmware:
 
     @property
     def runs(self) -> bool:
-        """Whether the process is there."""
+        """Whether the process runs."""
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
@@ -268,7 +268,7 @@ class CommandLine:
         return data.decode("ascii", "replace")
 
     def ask(self, text: str) -> str:
-        """Give a command; what it says. Raises `RunError`: it is refused."""
+        """Send a command and return its output. Raises `RunError`: it is refused."""
         self._socket.sendall(text.encode() + b"\n")
         answer = self._read_until()
         if "###ERROR" in answer:
@@ -278,7 +278,7 @@ class CommandLine:
         return answer
 
     def read(self, name: str) -> str:
-        """Value of a setting as the firmware prints it; empty where it prints none."""
+        """Return the value of a setting as the firmware prints it; empty if it prints none."""
         command = name.split()[0]
         answer = self.ask(command if " " in name else f"get {name}")
         start = f"{name} " if " " in name else f"{name} = "
@@ -297,8 +297,6 @@ class CommandLine:
 
 
 def _end_with_parent() -> None:
-    """End the firmware, on Linux, when the process that started it is gone,
-    however that ended.
-    """
+    """End the firmware when its parent process ends for any reason (Linux only)."""
     if sys.platform == "linux":
         _LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -126,7 +126,7 @@ class Sensors:
         return np.frombuffer(answer, np.float32, offset=TIME).reshape(-1, MOTORS)[:, OURS]
 
     def rest(self, period: float) -> None:
-        """Let it run for a period [s] with a vehicle that stands still, as at the last time."""
+        """Let the firmware run for a period [s] with a vehicle at rest in its last attitude."""
         self._stamp += period
         self._run(sample(self._stamp, *self._last))
 
@@ -139,7 +139,7 @@ class Sensors:
             self.rest(STEP)
 
     def close(self) -> None:
-        """Give the socket back."""
+        """Close the socket."""
         self._socket.close()
 
 

@@ -3,8 +3,8 @@ bodies.
 
 PX4 flies the vehicle that its ``sihsim`` simulates and reports the vehicle's true state; the ball
 hangs below as a point on a massless rope, is dragged along, and flies freely once the mechanism's
-output has moved. The vehicle does not feel it: SIH takes no force from outside. PX4's clock runs
-the ball, so that a busy machine slows both alike. The runner speaks to PX4 by itself.
+output has moved. It exerts no force on the vehicle, because SIH accepts no external forces. PX4's
+clock runs the ball, so that a busy machine slows both alike. The runner speaks to PX4 by itself.
 
 Source: docs.px4.io, Simulation-In-Hardware; PX4-Autopilot, src/modules/mavlink/streams/
 HIL_STATE_QUATERNION.hpp, src/modules/simulation/simulator_sih/sih.cpp."""
@@ -40,7 +40,7 @@ STREAMS = {
 ORIGIN = ("SIH_LOC_LAT0", "SIH_LOC_LON0", "SIH_LOC_H0")  # of SIH's world [deg, deg, m]
 ASK_AGAIN = 1.0  # between two requests for a stream or a parameter [s]: an answer may be lost
 PATIENCE = 1.0  # for the next state of a PX4 that was heard [s]; then the ball goes on without it
-ARRIVED = 50.0  # an output this near to its target has arrived [us]
+ARRIVED = 50.0  # tolerance within which an output has reached its target [us]
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down to ours
 
 HALVING = 1.4  # a slow swing halves in this time, as below the simulator's hovering vehicle [s]
@@ -118,8 +118,8 @@ class HangingBall:
         }
 
     def follow(self, motion: Motion) -> None:
-        """Take the vehicle's motion at a time, later than those before; the first one hangs the
-        ball below it.
+        """Add the vehicle's motion at a time later than the earlier ones; at the first one the
+        ball hangs below the vehicle.
         """
         self._motions.append(motion)
         if not self._hangs:
@@ -132,7 +132,7 @@ class HangingBall:
         return self._motions[-1].time if self._motions else -math.inf
 
     def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
-        """Advance by a period; see `WirePlant`. The command is PX4's matter."""
+        """Advance by a period; see `WirePlant`. The command is ignored, because PX4 flies."""
         if release and self._trip is None:
             self._trip = self.time + after
         for k in range(1, round(self.period / STEP) + 1):
@@ -301,7 +301,7 @@ class Px4Sih(Bridge):
         self.plant.follow(Motion(time, *place, quat / norm(quat), rate))
 
     def fly(self) -> None:
-        """Fly a period once PX4 has flown it; without PX4, a period as it was."""
+        """Fly a period once PX4 has flown it; without PX4, without a new motion."""
         target = self.plant.time + self.plant.period - SLACK
         end = monotonic() + PATIENCE
         waits = self.paced
@@ -321,14 +321,14 @@ class Px4Sih(Bridge):
         return np.zeros(4)
 
     def emit(self) -> None:
-        """Say nothing before PX4 has said where the vehicle is."""
+        """Send nothing before PX4 has reported the vehicle's position."""
         if self.heard_of:
             super().emit()
         else:
             self.speak()
 
     def speak(self) -> None:
-        """Ask for what is not coming."""
+        """Request missing streams and parameters."""
         target = self.params.system, self.params.component
         for number, period in STREAMS.items():
             if self._due(number):
