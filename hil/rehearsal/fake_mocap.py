@@ -44,8 +44,8 @@ class Mocap:
         """Measure both bodies at this time [s], which is the due one, of their true ``pos_w``,
         ``quat_wb`` and ``payload_pos_w``.
 
-        Those that are not lost come back, vehicle first, in our frames; their arrival is the
-        latency after the instant."""
+        Return the poses that are not lost, vehicle first, in our frames; they arrive after the
+        latency."""
         self._next += 1.0 / self.params.rate
         p = self.params
         rng = self._rng

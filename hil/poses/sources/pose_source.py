@@ -16,7 +16,7 @@ from hil.poses.pose import Pose
 class Source:
     """A source of poses; polling never waits and never raises.
 
-    ``rosters`` say who was heard, and count what was refused.
+    ``rosters`` hold the known senders and count refused traffic.
     """
 
     ended: bool = False  # whether no further poses will arrive
