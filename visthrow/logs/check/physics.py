@@ -1,4 +1,4 @@
-"""Checks of units, frames and delays by physics: what must follow from what, whatever the vehicle.
+"""Checks of units, frames and delays by physical relations that hold for any vehicle.
 
 Onboard-safe.
 """
@@ -16,54 +16,53 @@ from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
 
-# below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
-# to be compared
+# smallest speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] at which channels are compared
 MOVES = 0.05
-_FASTEST_TURN = 40.0  # from sample to sample: above, an attitude jumps [rad/s]
-_AROUND_JUMP = 0.06  # rates are taken over as much [s]
+_FASTEST_TURN = 40.0  # rate between two samples above which an attitude jumps [rad/s]
+_AROUND_JUMP = 0.06  # time over which rates are computed [s]
 STEEPEST = 75.0  # median tilt of a flight [deg]
-TURNED = 30.0  # by which no mount is off, and forces of a flight do not point aside [deg]
+TURNED = 30.0  # larger than a mount's error and the lean of a flight's mean force [deg]
 
 ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST = 60.0  # of vehicles that throw [m/s]
 _FARTHEST = 2000.0  # likewise [m]
 _SHARES = ("motor_command", "motor_wanted", "throttle")
-# of a command whose full size is 1; what a controller asks for may exceed it, a wrong unit by far
-# more
+# largest command with full scale 1; a controller's demand may exceed 1, a wrong unit by far more
 _LARGEST_SHARE = 2.0
 _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
-# correlations: of one flight, surely of one flight, and by how much other axes must be better
+# correlations: of the same flight, surely of the same flight, and margin by which other axes fit
+# better
 BELONGS = 0.35
 FIRMLY = 0.7
 CLEARLY = 0.12
-_LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
+_LIVELY = 0.2  # rates that noise and air currents alone do not cause [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 DELAY_BAD = 0.05
-LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
-_RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
-DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
-_UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
+LATEST = 0.16  # largest delay of motors with filters, which is 0 to 0.12 s in practice [s]
+_RESPONSE = 0.1  # half of the longest time in which rates follow their commands [s]
+DELAY_KNOWN = 0.012  # standard deviation below which a delay is known [s]
+_UNTOLD = 0.15  # standard deviation above which a delay is unknown [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
-_NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
-_SHARED = 3.0  # accelerations that share their samples: as many times fewer are independent
-# RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
+_NATS = 10.0  # evidence needed for other axes: a share e^-10 of valid logs would be rejected
+_SHARED = 3.0  # factor by which overlapping accelerations have fewer independent samples
+# RMS acceleration above the noise of accelerometers and the effect of air currents [m/s^2]
 _PUSHED = 0.2
-_LONGER = 0.05  # of the model's length: markers sit off the ends
-_OTHER_CABLE = 0.25  # likewise: another cable
+_LONGER = 0.05  # relative difference from the model's length: markers are not at the cable's ends
+_OTHER_CABLE = 0.25  # relative difference from the model's length of another cable
 _COMPARED = 4000  # samples of an accelerometer that are compared at each delay
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
-# correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
+# correlation of the small forces in the rotor plane (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
 _FORCES = (0.5, 2.0)  # ratios of two measurements of one force
-_TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
-_HEAVIEST = 0.9  # share of the mass that a payload may have
+_TAUT = 0.1  # relative deviation of a taut cable's length from its median
+_HEAVIEST = 0.9  # largest share of the payload in the total mass
 _UP = np.array([0.0, 0.0, GRAVITY])  # what an accelerometer at rest measures [m/s^2]
-_OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
+_OFFSET = 0.5  # mean acceleration due to bias and tilt of an accelerometer [m/s^2]
 
 
 def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
-    """Yield the findings of all checks of what moves how in one flight."""
+    """Yield the findings of all physical checks of a flight."""
     yield from _plausible(log)
     for prefix in _PREFIXES:
         pos = f"{prefix}pos_w"
@@ -82,14 +81,14 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
 
 
 def is_usable(samples: Samples | None, threshold: float) -> bool:
-    """Tell whether there are enough samples, of something that moves by more than a threshold."""
+    """Return whether there are enough samples, with a spread above a threshold."""
     if samples is None or len(samples.time) <= 50:
         return False
     return bool(np.max(np.std(samples.values, axis=0)) > threshold)
 
 
 def median_tilt(quat: np.ndarray) -> float:
-    """Middle of the angles from upright of attitudes, shape (N, 4) [deg]."""
+    """Return the median tilt of attitudes, shape (N, 4) [deg]."""
     up = matrix_of_quat(quat)[:, 2, 2]
     return np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0))))
 
@@ -104,7 +103,7 @@ def _plausible(log: FlightLog) -> Iterator[Row]:
 
 
 def _plausible_path(name: str, path: Samples) -> Iterator[Row]:
-    """Report positions that come, move or reach as no vehicle's do."""
+    """Report positions with a sampling period, speed or range that no vehicle has."""
     period = np.median(np.diff(path.time))
     if not _PERIOD[0] <= period <= _PERIOD[1]:
         text = (
@@ -128,7 +127,7 @@ def _plausible_path(name: str, path: Samples) -> Iterator[Row]:
 
 
 def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
-    """Commands, voltages and angles of a size that only another unit gives them."""
+    """Report commands, voltages and angles whose size shows a wrong unit."""
     for name in ATTITUDES:
         attitude = log.samples(name)
         tilt = 0.0 if attitude is None else median_tilt(attitude.values)
@@ -173,7 +172,7 @@ def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
 
 
 def _steady_rates(attitudes: Samples) -> Samples:
-    """Return body rates of attitudes but for those across a jump, as of an estimate's reset."""
+    """Return body rates of attitudes without those across jumps, such as an estimate's reset."""
     rates = attitudes.rates()
     fine = attitudes.rates(0.0)
     jumps = fine.time[np.linalg.norm(fine.values, axis=1) > _FASTEST_TURN]
@@ -187,7 +186,7 @@ def _steady_rates(attitudes: Samples) -> Samples:
 def _compare(
     first: Samples, second: Samples, channels: str, one_clock: bool = False
 ) -> Iterator[Row]:
-    """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
+    """Report the relation of two measurements of the same motion; ``one_clock``: of one message."""
     relation = relations.relate(first, second)
     if relation is None:
         return
@@ -209,13 +208,13 @@ def _compare(
 def _together_rows(
     relation: relations.Relation, channels: str, figures: dict, usual: tuple[float, float]
 ) -> Iterator[Row]:
-    """Rows about a pair that goes together in its axes; ``usual``: ratios of two such signals."""
+    """Report scale and delay of a pair that correlates in its axes; ``usual``: range of ratios."""
     text = f"go together as they are, correlation {relation.correlation:.2f}"
     yield Row("frames", channels, "ok", text, figures)
     if usual[0] < relation.scale < usual[1]:
         return
     hint = relations.unit_hint(relation.scale)
-    # noise of the first alone takes from the ratio what it takes from the correlation's square
+    # noise of the first signal reduces the ratio as much as the square of the correlation
     lowest = usual[0] * relation.correlation**2
     weak = not hint and lowest < relation.scale < usual[1]
     text = f"the second is {relation.scale:.4g} times the first: "
@@ -224,7 +223,7 @@ def _together_rows(
 
 
 def _spread(vectors: np.ndarray) -> float:
-    """Root mean square of vectors about their mean, shape (N, 3)."""
+    """Return the root mean square deviation of vectors from their mean, shape (N, 3)."""
     return np.sqrt(np.sum(np.var(vectors, axis=0)))
 
 
@@ -242,13 +241,13 @@ def _is_turned(relation: relations.Relation) -> bool:
 
 
 def _report_other_axes(relation: relations.Relation, channels: str, words: str) -> Row:
-    """Report a pair that goes together in other axes."""
+    """Report a pair that correlates in other axes."""
     figures = _figures(relation) | {"axes": relation.axes, "nats": relation.nats}
     return Row("frames", channels, "bad", f"{words} as {_better(relation)}", figures)
 
 
 def _better(relation: relations.Relation, whose: str = "") -> str:
-    """Words about an exchange of axes that beats those as they are."""
+    """Return the text on an exchange of axes that correlates better than the axes as they are."""
     kind = "a mirror image" if is_mirror(relation.axes) else "axes exchanged or turned"
     text = f"({relation.axes}){whose}, {relation.nats:.0f} nats better: {kind} "
     return text + f"(correlation {relation.axes_correlation:.2f}, not {relation.correlation:.2f})"
@@ -283,8 +282,8 @@ def _report_delay(
 
 
 def _disagrees(relation: relations.Relation) -> bool:
-    """Whether two signals hardly go together, in whatever axes; the best of 48 exchanges reaches
-    0.5 by chance.
+    """Return whether two signals hardly correlate in any axes; the best of 48 exchanges reaches 0.5
+    by chance.
     """
     return relation.axes_correlation < BELONGS or (
         relation.correlation < BELONGS and relation.axes_correlation < FIRMLY
@@ -292,7 +291,7 @@ def _disagrees(relation: relations.Relation) -> bool:
 
 
 def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
-    """Check that the mean force on the body, turned to the world, carries the vehicle."""
+    """Check that the mean specific force, rotated to the world frame, balances gravity."""
     attitude = log.samples(quat)
     force_b = log.samples("acc_b")
     if attitude is None or force_b is None:
@@ -325,11 +324,11 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
 
 
 def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
-    """Hold what pushes the vehicle, by accelerometer and attitude, against how its velocity
-    changes.
+    """Compare the force on the vehicle, by accelerometer and attitude, with the change of its
+    velocity.
 
-    Without an accelerometer the push is a multirotor's thrust, along body z, on vehicle and payload
-    together."""
+    Without an accelerometer, the force is a multirotor's thrust along body z, which acts on vehicle
+    and payload together."""
     motion = log.samples(path)
     attitude = log.samples(quat)
     if motion is None or attitude is None:
@@ -373,12 +372,12 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
 
 
 def _list_unchecked(acc: np.ndarray) -> Iterator[Row]:
-    """Name the axes along which a path hardly accelerates, shape (N, 3): its mirror image fits as
-    well.
+    """Report the axes along which a path hardly accelerates, so that its mirror image fits as well;
+    ``acc``: shape (N, 3).
     """
     power = np.var(acc, axis=0)
     share = power / np.sum(power)
-    needed = 0.5 * CLEARLY  # what a mirror image turns counts twice in a correlation
+    needed = 0.5 * CLEARLY  # a mirror image changes a correlation by twice the mirrored share
     for axis, part in zip("xy", share.tolist()):
         if part < needed:
             text = (
@@ -389,7 +388,7 @@ def _list_unchecked(acc: np.ndarray) -> Iterator[Row]:
 
 
 def _report_turned_path(turn: headings.Turn, channels: str) -> Row | None:
-    """Return a row where positions and velocities are surely turned about z."""
+    """Return a row if positions and velocities are surely turned about z, else None."""
     if turn.nats < _NATS or turn.alone < CLEARLY:
         return None
     angle, sd = np.degrees([turn.angle, turn.sd])
@@ -404,8 +403,8 @@ def _report_turned_path(turn: headings.Turn, channels: str) -> Row | None:
 def _find_hanging(
     log: FlightLog, quat: str, time: np.ndarray, acc: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return at which times the payload hangs on its cable, shape (N,), and its acceleration less
-    the vehicle's [m/s^2], shape (N, 3); always and 0 where no payload is measured.
+    """Return whether the payload hangs on its cable at each time, shape (N,), and its acceleration
+    relative to the vehicle [m/s^2], shape (N, 3); all true and 0 if no payload is measured.
     """
     place = log.samples(quat.replace("quat_wb", "pos_w"), 1)
     payload = log.samples("payload_pos_w")
@@ -422,8 +421,8 @@ def _find_hanging(
 
 
 def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Return the acceleration of vehicle and payload together [m/s^2]: with the payload's share of
-    the mass that makes it follow the thrust best.
+    """Return the acceleration of the common centre of mass of vehicle and payload [m/s^2], for the
+    payload's share of the mass with which it follows the thrust best.
     """
     up = matrix_of_quat(turn)[:, :, 2]
     lean = (up / np.maximum(up[:, 2:], 0.2))[:, :2]
@@ -435,8 +434,8 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
 
 
 def _compute_leans(acc: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return accelerations and the push of a thrust along body z that carries them, both level
-    [m/s^2], shape (N, 3).
+    """Return the horizontal parts of accelerations, and of a thrust along body z that has their
+    vertical part, both [m/s^2], shape (N, 3).
     """
     level = np.array([1.0, 1.0, 0.0])
     up = matrix_of_quat(turn)[:, :, 2]
@@ -445,35 +444,33 @@ def _compute_leans(acc: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def sparse(time: np.ndarray) -> bool:
-    """Return whether samples are so far apart that single ones say nothing about the mean force
-    between them.
-    """
+    """Return whether the sampling period is too long to average the force between samples."""
     return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
 @dataclass(frozen=True)
 class _LevelForces:
-    """Correlations of level forces by an accelerometer with those by a path, at the delay at which
-    they go together best.
+    """Correlations of lateral forces by an accelerometer and by a path, at the delay with the
+    highest correlation.
     """
 
-    plain: float  # largest correlation as they are, at any delay
-    turned: complex  # size: correlation where they are turned; angle: by which
-    mirrored: float  # correlation with their mirror image
-    size: float  # of those by the accelerometer, in that of those by the path
+    plain: float  # largest correlation of the axes as they are, at any delay
+    turned: complex  # absolute value: correlation after a rotation; argument: its angle
+    mirrored: float  # correlation with the mirror image
+    size: float  # ratio of the accelerometer's forces to those by the path
     relation: relations.Relation | None  # between both
 
     @property
     def correlation(self) -> float:
-        """Correlation where they are turned or mirrored, kept below 1."""
+        """Correlation after a rotation or reflection, limited to below 1."""
         return min(max(abs(self.turned), self.mirrored), 0.999)
 
 
 def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelForces | None:
-    """Compare level forces at delays of an attitude and an accelerometer of one clock, which may be
-    late beside the path; None where too few samples are known, or nothing moves sideways.
+    """Compare lateral forces at delays of attitude and accelerometer, which share a clock, relative
+    to the path; None with too few samples or without lateral motion.
     """
-    reach = 2.0 * DELAY_BAD  # half of that refuses a log
+    reach = 2.0 * DELAY_BAD  # half of it already excludes a log
     first = force_b.time[0] + _SPAN + reach
     last = force_b.time[-1] - _SPAN - reach
     known = np.flatnonzero((acc.time > first) & (acc.time < last))
@@ -506,9 +503,9 @@ def _compare_level(acc: Samples, attitude: Samples, force_b: Samples) -> _LevelF
 def _report_turned_body(
     acc: Samples, attitude: Samples, force_b: Samples, channels: str
 ) -> Row | None:
-    """Return a row where an accelerometer's x and y fit better exchanged, or turned about z. They
-    feel drag and cable alone; z, which feels the thrust, is left out.
-    """
+    """Return a row if an accelerometer's x and y fit better exchanged or turned about z, else None.
+
+    They measure only drag and cable forces; z, which measures the thrust, is left out."""
     forces = _compare_level(acc, attitude, force_b)
     if forces is None or forces.relation is None:
         return None
@@ -517,7 +514,7 @@ def _report_turned_body(
     correlation = forces.correlation
     samples = np.ptp(acc.time) / relations.INDEPENDENT
     nats = 0.5 * samples * np.log((1.0 - plain**2) / (1.0 - correlation**2))
-    nats -= np.log(len(EXCHANGES))  # an angle is a choice like that among exchanges
+    nats -= np.log(len(EXCHANGES))  # penalty for a free angle, as for an exchange
     surely = nats > _NATS and correlation > max(_CORRELATED, plain + CLEARLY)
     keeps_size = _FORCES[0] < forces.size < _FORCES[1]  # as any mount does
     if not (surely and keeps_size):
@@ -526,13 +523,13 @@ def _report_turned_body(
     off_quarter = abs(angle - 90.0 * round(angle / 90.0))
     is_quarter = off_quarter < 0.5 * TURNED < abs(angle)
     is_mirror_image = forces.mirrored > abs(forces.turned)
-    # axes that are exchanged do not correlate as they are
+    # exchanged axes do not correlate without the exchange
     if plain < BELONGS and (is_mirror_image or is_quarter):
         figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
         return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
     if is_mirror_image or abs(angle) < TURNED:
         return None
-    # a warning: of an estimated attitude, which leans, a circle looks turned as well
+    # only a warning: with an estimated attitude that leans, a circle looks turned too
     text = (
         f"acc_b fits turned by {angle:+.0f} deg about z, {nats:.0f} nats better (correlation"
         f" {correlation:.2f}, not {plain:.2f}): its mount, or axes of the attitude"
@@ -541,8 +538,8 @@ def _report_turned_body(
 
 
 def _level_correlations(first: np.ndarray, second: np.ndarray) -> tuple[complex, complex]:
-    """Return correlations of vectors, shape (N, 3), in x and y: their angles are those by which the
-    second are turned beside the first, and beside the first's mirror image.
+    """Return the complex correlations of vectors, shape (N, 3), in x and y; their arguments are the
+    angles of the second relative to the first, and relative to the first's mirror image.
     """
     a, b = (v[:, 0] + 1j * v[:, 1] for v in (first, second))
     a = a - np.mean(a)
@@ -552,8 +549,8 @@ def _level_correlations(first: np.ndarray, second: np.ndarray) -> tuple[complex,
 
 
 def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
-    """Return accelerations [m/s^2] of positions (unit m) or velocities, over about ``span`` seconds
-    each.
+    """Return accelerations [m/s^2] of positions (unit "m") or velocities, by differences over about
+    ``span`` seconds.
     """
     velocities = path.derivative(span) if unit == "m" else path
     return velocities.derivative(span)
@@ -562,7 +559,7 @@ def accelerations(path: Samples, unit: str, span: float = _SPAN) -> Samples:
 def _check_push(
     relation: relations.Relation, acc: np.ndarray, pushed: np.ndarray, channels: str, sensed: bool
 ) -> Iterator[Row]:
-    """Rows about a push that has the axes of the change of velocity."""
+    """Report scale and delay of a force whose axes are those of the change of velocity."""
     off = np.mean(pushed - acc, axis=0)
     figures = {
         "correlation": relation.correlation,
@@ -571,7 +568,7 @@ def _check_push(
         "offset_m_s2": off.tolist(),
     }
     if relation.correlation < FIRMLY:
-        if sensed:  # else a payload or a draught pushes as well
+        if sensed:  # otherwise forces of a payload or the air are missing
             strong = relation.correlation < BELONGS and _spread(acc) > 1.0
             text = (
                 f"hardly go together (correlation {relation.correlation:.2f}):"
@@ -591,7 +588,7 @@ def _check_push(
 
 
 def _report_exchange(relation: relations.Relation, channels: str) -> Row | None:
-    """Report a path that goes with the push in other axes."""
+    """Report a path that correlates with the force in other axes; None if it does not."""
     firm = relation.axes_correlation > _CORRELATED and relation.nats > _SHARED * _NATS
     if not firm or not _is_turned(relation):
         return None
@@ -601,7 +598,7 @@ def _report_exchange(relation: relations.Relation, channels: str) -> Row | None:
 
 
 def _still_gravity(log: FlightLog) -> Iterator[Row]:
-    """Without an attitude: the size of the force, in its median."""
+    """Check the median magnitude of the specific force of a log without attitude."""
     force_b = log.samples("acc_b", 20)
     if force_b is None or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
         return
@@ -616,7 +613,7 @@ def _still_gravity(log: FlightLog) -> Iterator[Row]:
 
 
 def _commands(log: FlightLog) -> Iterator[Row]:
-    """Whether the measured rates, or those of the measured attitude, follow what was commanded."""
+    """Check that measured rates, or those of the measured attitude, follow the commands."""
     if "rate_b" in log:
         turning = "rate_b"
         rates = log["rate_b"].samples()
@@ -632,7 +629,7 @@ def _commands(log: FlightLog) -> Iterator[Row]:
         if name not in log:
             continue
         time, values = log[name].samples()
-        set_points = Samples(time, values[:, -3:])  # a command's first is thrust
+        set_points = Samples(time, values[:, -3:])  # the first component of a command is thrust
         relation = relations.relate(set_points, rates) if is_usable(set_points, MOVES) else None
         if relation is not None:
             channels = f"{name}, {turning}"
@@ -644,8 +641,8 @@ def _commands(log: FlightLog) -> Iterator[Row]:
 def _report_early_rates(
     relation: relations.Relation, set_points: Samples, rates: Samples, channels: str
 ) -> Row | None:
-    """Report rates that go before their commands: if no delay that a controller has fits them as
-    well, the clock of the commands is late. A swing that a controller opposes fits both.
+    """Report rates that precede their commands, if no delay that a controller can have fits as
+    well: the clock of the commands is late. Both fit a swing that a controller opposes.
     """
     if relation.axes_delay > -DELAY_BAD or relation.axes_correlation < FIRMLY:
         return None
@@ -676,7 +673,7 @@ def _check_following(
         relation: Of the rates to the commands.
         channels: Both names.
         spread: Largest deviation of the rates [rad/s].
-        period: Of the slower of both [s].
+        period: Longer sampling period of both [s].
     """
     figures = _figures(relation)
     if _disagrees(relation) and period > 0.5 * _RESPONSE:
@@ -694,7 +691,7 @@ def _check_following(
     early = is_measured and relation.delay < -0.005
     slow = is_measured and relation.delay - 2.0 * relation.delay_sd > LATEST
     hint = relations.unit_hint(relation.scale)
-    hint = hint if "degrees" in hint else ""  # a gain may be any other number
+    hint = hint if "degrees" in hint else ""  # any other ratio may be a gain
     weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if early or slow or weak else "ok"
     when = f"{1e3 * relation.delay:.1f} ms later" if is_measured else "at an unknown delay"
@@ -714,8 +711,8 @@ def _check_following(
 
 
 def hangs(log: FlightLog, time: np.ndarray) -> np.ndarray:
-    """Tell at which times [s] the payload hangs: as the log says, or until its release is commanded
-    first; always where the log does not tell.
+    """Return whether the payload hangs at each time [s]: by the channel ``attached``, or until the
+    first release command; always true without both channels.
     """
     if "attached" in log:
         return log["attached"].hold(time) > 0.5
@@ -769,7 +766,7 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
 
 
 def _check_early_release(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:
-    """Report a payload that leaves its cable before its release is commanded."""
+    """Report a payload that leaves the cable before its release is commanded."""
     if "release_command" not in log:
         return
     stamps, pressed = log["release_command"].samples()
@@ -779,13 +776,13 @@ def _check_early_release(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> I
     length = np.linalg.norm(gap, axis=1)
     hangs = (gap[:, 2] < -0.5 * length) & (
         time < stamps[commanded[0]]
-    )  # not beside it on the floor
+    )  # not next to the vehicle on the floor
     if not np.any(hangs):
         return
     taut = np.flatnonzero(length < (1.0 + _TAUT) * np.median(length[hangs]))
     if taut[-1] == len(time) - 1:
         return
-    since = stamps[max(commanded[0] - 1, 0)]  # the command came after this sample
+    since = stamps[max(commanded[0] - 1, 0)]  # the command is later than this sample
     early = since - time[taut[-1] + 1]
     if early < DELAY_BAD:
         return
@@ -806,7 +803,7 @@ def _length(middle: float, expected: float, channels: str) -> Row:
 
 
 def _report_payload_delay(place: Samples, payload: Samples, channels: str) -> Iterator[Row]:
-    """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
+    """Report the delay of the payload's stream, at which the cable's length varies least."""
     delays = np.arange(-0.2, 0.2001, 0.01)
     overlap = (payload.time > place.time[0] + 0.2) & (payload.time < place.time[-1] - 0.2)
     if np.sum(overlap) < 50:
@@ -817,7 +814,7 @@ def _report_payload_delay(place: Samples, payload: Samples, channels: str) -> It
     best = int(np.argmin(spread))
     delay = delays[best]
     independent = max(np.ptp(time) / relations.INDEPENDENT, 10.0)
-    floor = 1e-9  # of a cable's length without any noise [m]
+    floor = 1e-9  # smallest spread of a cable's length without noise [m]
     plain, least = np.maximum(spread[[len(delays) // 2, best]], floor)
     nats = independent * np.log(plain / least)
     if nats < _NATS or best in (0, len(delays) - 1) or abs(delay) < _DELAY_WARN:
@@ -831,9 +828,7 @@ def _report_payload_delay(place: Samples, payload: Samples, channels: str) -> It
 
 
 def _check_same_quantity(log: FlightLog) -> Iterator[Row]:
-    """Two measurements of one quantity on different clocks: the delay between them, and whether it
-    holds.
-    """
+    """Compare measurements of one quantity on different clocks: delay, and drift of the delay."""
     bad = False
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         a = log.samples(first)
@@ -853,7 +848,7 @@ def _cut(samples: Samples, start: float, end: float) -> Samples:
 
 
 def _drift(first: Samples, second: Samples, channels: str) -> Iterator[Row]:
-    """Whether the delay is the same from piece to piece of 5 s."""
+    """Report a delay that differs between parts of 5 s."""
     starts = []
     delays = []
     piece = 5.0

@@ -1,4 +1,4 @@
-"""All checks of several logs; their verdict and table."""
+"""Checks of several logs, with their verdicts and the table for the user."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,10 @@ from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers.vehicles import Vehicle
 
-_ALIKE = 0.2  # logs that share a larger part of their samples are copies of one another
-_ONE_PAYLOAD = 0.005  # two logs whose payloads' paths agree to this [m] hold one payload
+_ALIKE = 0.2  # share of common samples above which two logs are copies
+_ONE_PAYLOAD = 0.005  # largest difference of the paths of the same payload in two logs [m]
 _MOST_PAIRED = 12
-# of the logarithm of thrust over force, that a battery's charge alone does not make
+# difference of the logarithm of thrust over force that a battery's charge alone does not cause
 _OTHER_SCALE = 0.08
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
@@ -30,12 +30,12 @@ class Checked:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst row's; what cannot be answered is no fault of the log."""
+        """The worst verdict of the rows, without those on questions that cannot be answered."""
         return worst([row for row in self.rows if row.topic != "answers"])
 
 
 def check(logs: Sequence[FlightLog], vehicle: KnownVehicle = NOTHING) -> list[Checked]:
-    """Look at logs one by one, and at what they have in common."""
+    """Check logs one by one, and check their common samples, payloads and masses."""
     common = [*_copies(logs), *_compare_shared_payloads(logs), *_masses(logs, vehicle)]
     checked = []
     for i, log in enumerate(logs):
@@ -45,17 +45,17 @@ def check(logs: Sequence[FlightLog], vehicle: KnownVehicle = NOTHING) -> list[Ch
 
 
 CONTRADICT = ("vehicle", "frames", "units", "delay", "thrust", "excited")
-"""Topics in which a bad finding keeps a log from naming causes: the channels are not of one flight
-and clock.
+"""Topics whose bad rows exclude a log from the diagnosis: its channels are not of one flight and
+clock.
 """
 
 
 def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozenset()) -> list[str]:
-    """Return the reasons not to name causes from logs: their channels contradict each other, or
-    nothing moved.
+    """Return the reasons not to diagnose logs: their channels contradict each other, or nothing
+    moved.
 
-    ``unread``: channels that the model does not read, and rows that are overruled, each by topic
-    and channel; a bad row about one of them is no reason."""
+    ``unread``: channels that the model does not read, and names of overruled rows (topic and
+    channel). Bad rows on one of them are no reason."""
     reasons = []
     for checked in results:
         ignored = unread - _find_agreeing(checked, unread)
@@ -68,8 +68,8 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
 
 
 def _find_agreeing(checked: Checked, unread: frozenset[str]) -> set[str]:
-    """Return velocities that go with a position that the model reads: what contradicts them
-    contradicts the position.
+    """Return the velocities that agree with a position that the model reads. A contradiction to
+    such a velocity also contradicts the position.
     """
     bad = {row.channel for row in checked.rows if row.verdict == "bad"}
     velocities = set()
@@ -81,8 +81,8 @@ def _find_agreeing(checked: Checked, unread: frozenset[str]) -> set[str]:
 
 
 def copies(results: Sequence[Checked]) -> dict[int, int]:
-    """Return the logs that hold what an earlier one holds, by number, and which one: a copy counts
-    once.
+    """Return the copies among logs: number of the log -> number of the earlier log with the same
+    samples.
     """
     return {
         i: row.figures["copy_of"]
@@ -93,7 +93,7 @@ def copies(results: Sequence[Checked]) -> dict[int, int]:
 
 
 def label(log: FlightLog, number: int) -> str:
-    """Name of a log for people."""
+    """Return the name of a log for the user."""
     source = Path(str(log.meta.get("source", f"log {number + 1}"))).name
     part = log.meta.get("part")
     return f"{source}:{part}" if part else source
@@ -129,7 +129,7 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
 
 
 def _cut_at_landing(log: FlightLog) -> FlightLog:
-    """Without the payload's samples after its landing: what lies on the floor stands still."""
+    """Return the log without the payload's samples after its landing."""
     if "landing" not in log or not len(log["landing"].time):
         return log
     channels = dict(log.channels)
@@ -139,7 +139,7 @@ def _cut_at_landing(log: FlightLog) -> FlightLog:
 
 
 def _reader(log: FlightLog) -> Iterator[Row]:
-    """Yield the notes of a binary log's reader."""
+    """Yield rows on the notes of a log's reader."""
     corrupt = log.meta.get("corrupt", 0)
     dropped = log.meta.get("dropped", 0)
     if corrupt or dropped:
@@ -180,7 +180,7 @@ def _clocks(log: FlightLog) -> Iterator[Row]:
 
 
 def _copies(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
-    """Report logs that hold what another one holds, each by its number."""
+    """Yield the number of each log that is a copy of an earlier one, and a row on it."""
     prints = [_prints(log) for log in logs]
     for i, j in combinations(range(len(logs)), 2):
         fewer = max(min(len(prints[i]), len(prints[j])), 1)
@@ -194,8 +194,8 @@ def _copies(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
 
 
 def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> Iterator[tuple[int, Row]]:
-    """Report logs whose ratio of force to thrust differs from the others': another battery,
-    vehicle, payload or map.
+    """Yield the number of each log whose ratio of thrust to force differs from the median, and a
+    row on it: another battery, vehicle, payload or thrust map.
     """
     carried = [thrust_checks.mass_of(log, vehicle) for log in logs]
     known = [mass for mass in carried if mass is not None]
@@ -219,7 +219,7 @@ def _compare_shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, R
     for (first, a), (second, b) in combinations(paths.items(), 2):
         if not (physics.is_usable(a, physics.MOVES) or physics.is_usable(b, physics.MOVES)):
             continue
-        # on a straight path an offset of positions looks like a delay; velocities have none
+        # on a straight path, an offset of positions looks like a delay; velocities have no offset
         relation = relations.relate(a.derivative(), b.derivative())
         if relation is None or relation.delay_sd > physics.DELAY_KNOWN:
             continue
@@ -241,7 +241,7 @@ def _compare_shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, R
 
 
 def _prints(log: FlightLog) -> set[bytes]:
-    """Short runs of samples, whatever their time stamps."""
+    """Return fingerprints of a log: short sequences of samples, without their time stamps."""
     prints: set[bytes] = set()
     for name, channel in log.channels.items():
         moving = any(word in name for word in _MOVING) and channel.values.dtype.kind != "b"
@@ -259,7 +259,9 @@ def _prints(log: FlightLog) -> set[bytes]:
 
 
 def table(checked: Checked, all_rows: bool = False) -> str:
-    """Print a log's rows; noise and clocks that are fine only on demand."""
+    """Return the table of a log's rows; ``all_rows``: also those on noise, clocks and gaps without
+    a fault.
+    """
     marks = {"ok": "ok  ", "warn": "WARN", "bad": "BAD "}
     lines = [f"{checked.name}: {checked.verdict}"]
     visible = [

@@ -1,6 +1,4 @@
-"""Checks of thrust and rotors: the force that a log commands against the force that it measures,
-and rotor against rotor.
-"""
+"""Checks of thrust and rotors: commanded thrust and measured force, and rotors among each other."""
 
 from collections.abc import Iterator, Sequence
 
@@ -36,50 +34,49 @@ INPUTS = (
     "motor_output",
     "pwm",
 )
-PULSES = ("motor_output", "pwm")  # or numbers from 0 up
+PULSES = ("motor_output", "pwm")  # pulse lengths, or numbers from 0 upwards
 ROTORS = ("motor_speed", "motor_command", "motor_output", "pwm")
 NAMES = ("front left", "front right", "rear left", "rear right")
 
 UNITS = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
 """Units of a thrust, in newtons."""
-_UNIT = 0.25  # of the logarithm of a ratio from a unit's
-_SPAN = 0.1  # over which both forces are averaged: vibration goes [s]
-# about a change of the load, within which some delay compares thrust and force of two loads [s]
+_UNIT = 0.25  # largest distance of a ratio's logarithm from a unit's
+_SPAN = 0.1  # averaging time of both forces, which removes vibration [s]
+# time around a change of the load in which thrust and force may belong to different loads [s]
 _CHANGING = 0.5
-_VARIES = 0.003  # of the mean, that a force must vary by before it says whether it follows
-# correlation; forces of 13 real flights follow their own thrust by 0.53 to 0.94, that of another by
-# 0.38 (median 0.15)
+_VARIES = 0.003  # smallest relative variation of a force at which it is compared
+# Correlation. In 13 real flights, force and thrust of the same flight correlate by 0.53 to 0.94, of
+# different flights by up to 0.38 (median 0.15).
 _FOLLOWS = 0.4
-# nats by which no thrust at all must explain the force better, before thrust counts as another
-# flight's
+# evidence for no relation to the thrust [nats] above which the thrust is of another flight
 _AGAINST = 8.0
-# samples over which a pack's charge and the warmth of motors leave force over thrust as it is: 2 s
+# samples (2 s) over which battery charge and motor temperature hardly change force over thrust
 _SAGGING = 200
-_DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
-_OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < LATEST)  # delays that motors have
-_MOTORS = 0.07  # what they usually take [s]
-MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
-MASS_BAD = 1.0  # likewise: another unit or map
-IDLE_PULSE = 1000.0  # length of a pulse at which a motor stands [us]
-_OUTLIER = 4.0  # robust deviations beyond which a crash or a tumble has its say cut
-IDLE_SPEED = 100.0  # a vehicle whose rotors stay below has not flown [rad/s]
-IDLE_SHARE = 0.12  # likewise, of the full command
-# of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
+_DELAYS = np.arange(-0.2, 0.4001, 0.01)  # candidates [s]
+_OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < LATEST)  # delays that motors can have
+_MOTORS = 0.07  # typical delay of motors [s]
+MASS_WARN = 0.15  # logarithm of thrust over weight that a battery's charge does not explain
+MASS_BAD = 1.0  # logarithm of thrust over weight with another unit or map
+IDLE_PULSE = 1000.0  # pulse length at which a motor stands still [us]
+_OUTLIER = 4.0  # limit of values, in robust deviations, against crashes and tumbles
+IDLE_SPEED = 100.0  # rotor speed below which a vehicle does not fly [rad/s]
+IDLE_SHARE = 0.12  # share of the full command below which a vehicle does not fly
+# logarithm of a rotor's value over the others'; a weight on an arm or a cut blade causes 0.25
 _UNEVEN = 0.4
 
 
 def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
-    """Yield the findings about thrust and rotors in one flight."""
+    """Yield the findings on thrust and rotors of a flight."""
     yield from _force(log, vehicle)
     yield from _rotors(log)
     yield from _check_turn_direction(log)
 
 
 def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Samples] | None:
-    """Return what a log says of its collective thrust.
+    """Return the collective thrust of a log.
 
-    Returns channel and thrust, shape (N, 1), in newtons where channel or map say so; None where it
-    says nothing."""
+    Returns channel and thrust, shape (N, 1), in newtons if the channel's unit or a map is known;
+    None if no channel holds a thrust."""
     name = vehicle.thrust_input or next((name for name in INPUTS if name in log), "")
     driver = log.samples(name)
     if driver is None:
@@ -97,12 +94,12 @@ def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Sam
 
 
 def are_pulses(outputs: np.ndarray) -> bool:
-    """Tell whether outputs to motors are lengths of pulses [us]."""
+    """Return whether outputs to motors are pulse lengths [us]."""
     return bool(IDLE_PULSE - 200.0 < np.median(outputs) < 2300.0)
 
 
 def follows(log: FlightLog, name: str) -> float | None:
-    """Return how well the measured force follows an input, as a correlation; None where unknown."""
+    """Return the correlation of the measured force with an input; None if it is unknown."""
     thrust = thrust_of(log, KnownVehicle(thrust_input=name))
     if thrust is None or np.median(thrust[1].values) <= 0.0:
         return None
@@ -111,8 +108,8 @@ def follows(log: FlightLog, name: str) -> float | None:
 
 
 def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
-    """Return the mass that a thrust in newtons carries in flight [kg]; None where the log does not
-    tell.
+    """Return the mass that a thrust in newtons carries in flight [kg]; None if a channel is missing
+    or the thrust is not in newtons.
     """
     thrust = thrust_of(log, vehicle)
     carried = thrust_over_force(log, vehicle)
@@ -122,15 +119,15 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
 
 
 def _in_newtons(name: str, vehicle: KnownVehicle) -> bool:
-    """Tell whether a thrust comes from a channel or map in newtons."""
+    """Return whether a thrust comes from a channel or map in newtons."""
     return vehicle.thrust_map is not None or name in ("command", "thrust_command")
 
 
 def thrust_over_force(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[float, str] | None:
-    """Return the mean thrust over the mean specific force along body z in flight, [kg] where the
-    thrust is in newtons, and what measures the force; None where the log does not tell.
+    """Return the ratio of mean thrust to mean specific force along body z in flight, [kg] for a
+    thrust in newtons, and the measurement of the force; None if one of them is unknown.
 
-    Both means hold through manoeuvres: the mean force is what changes the momentum.
+    The ratio of means also holds in manoeuvres, as the mean force is the change of momentum.
     """
     thrust_signal = thrust_of(log, vehicle)
     if thrust_signal is None:
@@ -140,13 +137,13 @@ def thrust_over_force(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[
         return None
     flies = thrust[:, 0] > 0.5 * _usual(thrust)
     carries = hangs(log, time)
-    if np.any(flies & carries):  # without its payload it is another mass
+    if np.any(flies & carries):  # the mass is that with the payload
         flies &= carries
     for measurement in ("acc_b", "path"):
         force = _measure_force_z(log, measurement)
         if force is None or not np.any(flies):
             continue
-        if measurement == "path":  # a jump of its capture is no force
+        if measurement == "path":  # reduces the effect of jumps of the motion capture
             force = Samples(force.time, _trim(force.values.T).T)
         acc = np.mean(force.at(time)[flies])
         if acc > 0.0:
@@ -160,8 +157,8 @@ def _usual(thrust: np.ndarray) -> float:
 
 
 def _load_changes(log: FlightLog) -> np.ndarray:
-    """Return the times at which the vehicle takes up a payload or gives it up, or is commanded to
-    [s]; none where the log does not tell.
+    """Return the times at which the vehicle picks up or releases a payload, or is commanded to [s];
+    empty without such channels.
     """
     channels = [name for name in ("attached", "release_command") if name in log]
     if not channels:
@@ -171,9 +168,9 @@ def _load_changes(log: FlightLog) -> np.ndarray:
 
 
 def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
-    """Hold the thrust against the force along body z, by the accelerometer and by the path:
-    vibration spoils the one, a draught none.
-    """
+    """Compare the thrust with the force along body z, by the accelerometer and by the path.
+
+    Vibration disturbs only the accelerometer; air currents disturb neither."""
     driver = vehicle.thrust_input
     if driver and driver not in log:
         text = f"the model reads it, and the log lacks it; {suggest(driver, log.channels)}"
@@ -200,8 +197,8 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
 
 
 def _report_following(name: str, measurement: str, curve: np.ndarray, against: float) -> Row:
-    """Report how the measured force follows a thrust, by their correlation at each delay and the
-    nats by which no thrust explains the force better.
+    """Report how the measured force follows a thrust; ``curve``: correlation at each delay,
+    ``against``: evidence for no relation between both [nats].
     """
     channels = f"{name}, {measurement}"
     peak = np.max(curve[_OF_MOTORS])
@@ -214,8 +211,8 @@ def _report_following(name: str, measurement: str, curve: np.ndarray, against: f
         "felt_by": measurement,
     }
     clearest = _DELAYS[np.argmax(curve)]
-    # A controller that answers gusts makes its thrust seem early, but never firmly; against the
-    # force before it, its thrust is opposed.
+    # Thrust with which a controller reacts to gusts opposes the force before it. So it seems early,
+    # but the correlation is never high.
     gusty = clearest > _MOTORS and peak >= _FOLLOWS
     other_clock = best > max(FIRMLY if gusty else _FOLLOWS, peak + CLEARLY)
     # a slow flight fits every delay nearly: what it leaves at the right one is far less
@@ -271,11 +268,11 @@ def _measure_force_z(log: FlightLog, measurement: str) -> Samples | None:
 
 
 def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.ndarray, float]]:
-    """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
-    explains the force better, for each measurement of the force that is known and varies.
+    """Yield, for each measurement of the force that varies, its name, the correlation with the
+    thrust in flight at each delay, and the evidence for no relation between both [nats].
 
-    Thrust is in proportion to the force while the mass is the same: each span between changes of
-    the load is compared with its mean.
+    Thrust is proportional to the force only for a constant mass. So both are relative to their
+    means between changes of the load.
     """
     thrust = command.values[:, 0]
     flies = command.time[thrust > 0.6 * _usual(thrust)]
@@ -308,14 +305,14 @@ def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.nd
 
 
 def _relative(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Return parts, each of shape (..., T), one after the other, relative to the mean of each."""
+    """Concatenate parts, each of shape (..., T), each relative to its mean."""
     return np.concatenate([p / np.mean(p, axis=-1, keepdims=True) - 1.0 for p in parts], axis=-1)
 
 
 def _curve(x: np.ndarray, varies: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return the correlation of a thrust, shape (T,), with the force at each delay, shape (D, T),
-    both relative to their means, and the nats by which no thrust explains the force better; None
-    where one does not vary.
+    both relative to their means, and the evidence for no relation between both [nats]; None if one
+    does not vary.
     """
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
@@ -328,7 +325,7 @@ def _curve(x: np.ndarray, varies: np.ndarray) -> tuple[np.ndarray, float] | None
 
 
 def _trim(values: np.ndarray) -> np.ndarray:
-    """Return values, shape (..., T), cut to what lies within some robust deviations of their
+    """Return values, shape (..., T), clipped to ``_OUTLIER`` robust deviations about their
     median.
     """
     middle = np.median(values, axis=-1, keepdims=True)
@@ -338,7 +335,7 @@ def _trim(values: np.ndarray) -> np.ndarray:
 
 
 def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
-    """Thrust over force against the mass that the model knows."""
+    """Compare the ratio of thrust to force with the mass of the model."""
     text = f"thrust over force {mass:.4g} kg"
     if not vehicle.mass:
         return Row("thrust", channels, "ok", text, {"mass_kg": mass})
@@ -363,7 +360,7 @@ def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
 
 
 def _rotors(log: FlightLog) -> Iterator[Row]:
-    """Each rotor against the others: a vehicle that hovers turns all of them alike."""
+    """Compare the rotors with each other: in hover, all have similar values."""
     for name in ROTORS:
         motors = log.samples(name)
         if motors is None or log[name].values.shape[1:] != (4,):
@@ -382,7 +379,7 @@ def _rotors(log: FlightLog) -> Iterator[Row]:
 
 
 def _uneven(ratio: float) -> str:
-    """Words about a rotor that reads so many times the others."""
+    """Return the text on a rotor whose value is ``ratio`` times the others'."""
     if ratio < 0.02:
         return "its sensor is dead, or the rotor stands"
     factor, miss = nearest(ratio, {"half: ": 2.0, "twice: ": 0.5})
@@ -391,7 +388,9 @@ def _uneven(ratio: float) -> str:
 
 
 def _check_turn_direction(log: FlightLog) -> Iterator[Row]:
-    """Which way the vehicle turns when motors differ: order of the motors, and sign."""
+    """Check order and sign of the motors by the direction in which their differences turn the
+    vehicle.
+    """
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), "")
     motors = log.samples(name)
     rate = log.samples("rate_b")
@@ -411,7 +410,7 @@ def _check_turn_direction(log: FlightLog) -> Iterator[Row]:
 
 
 def _check_turning(word: str, relation: relations.Relation, channels: str) -> Row:
-    """Report whether an axis turns as the motors drive it."""
+    """Report whether the vehicle turns about an axis in the direction of its motors' torque."""
     figures = {"correlation": relation.correlation, "delay_s": relation.delay}
     clear = relation.axes_correlation > relation.correlation + CLEARLY
     wrong = clear and relation.axes.startswith("-")
