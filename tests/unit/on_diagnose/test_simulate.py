@@ -94,9 +94,9 @@ def test_the_force_follows_the_thrust_past_a_release(tmp_path, speed):
     late = replace(command, values=np.roll(command.values, 40, axis=0))
     of_another_time = FlightLog({**log.channels, "command": late}, log.meta)
     rows, refused = (list(thrust_checks.look(each)) for each in (log, of_another_time))
-    assert [row.verdict for row in rows] == ["ok"], rows[0].text
-    assert "the force follows the thrust" in rows[0].text
-    assert [row.verdict for row in refused] == ["bad"]
+    assert {row.verdict for row in rows} == {"ok"}, rows[0].text
+    assert "the force follows the thrust" in rows[-1].text
+    assert refused[-1].verdict == "bad"
 
 
 @mark.parametrize("length", [0.33, 0.73])

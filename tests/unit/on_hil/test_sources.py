@@ -221,7 +221,7 @@ def test_csv_without_mapping(tmp_path):
     [
         (
             ('source.columns=[{name="pos_w", columns=["x", "y", "z"], unit="m"}]',),
-            "columns of a table need its time",
+            "a table needs both a time and columns",
         ),
         (
             (
