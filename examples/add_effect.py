@@ -1,5 +1,7 @@
 """Describe an effect as a table of configs/effects does, and apply it: how far it moves the ball.
 
+To let the diagnosis select it, add the same fields as a table to a file of configs/effects.
+
 python examples/add_effect.py --size 0.02
 """
 

@@ -1,6 +1,6 @@
 """The release of the payload: latched once, followed by the separation after a known lag and by the
-landing, which is found in the payload's poses. `hil.control.tick.commander` decides on the release
-and commands it.
+landing, which is found in the payload's poses. The policy's action decides on the release
+(`visthrow.onboard.actions.wants_release`); `hil.control.tick.commander` checks and commands it.
 """
 
 import math
@@ -45,9 +45,9 @@ LANDING_POSES = 8
 
 POSE_TIMEOUT = 0.1
 MOST_EXTRAPOLATION = 0.15
-"""A payload without poses for this long [s], whose free fall reaches the ground no longer than that
-after the last pose [s], counts as landed where the fall ends: after a gap in the poses the gate
-rejects those after the impact as a jump.
+"""A payload without poses for ``POSE_TIMEOUT`` [s] counts as landed where its free fall ends, if
+the fall ends at most ``MOST_EXTRAPOLATION`` [s] after the last pose. After a gap, the gate would
+reject the poses after the impact as a jump.
 """
 
 

@@ -6,7 +6,8 @@ autopilot. It has no side effects.
 
 ``idle`` waits for poses and the autopilot, ``check`` for the checks to hold for a while. From
 ``ready`` on the runner commands: its hover controller holds the vehicle. Each throw needs its own
-command of the operator."""
+command of the operator, which arms the *throw*. The vehicle's motors are armed by its back-end, in
+`hil.links.backends`."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,18 +1,16 @@
-"""Gate of a body: it rejects wrong poses, and gives the age of the last new one as a level (warn,
-hold, abort:
-
-``[gate]``).
+"""Gate of a body: it rejects wrong poses, and reports how old the last new pose is, as one of the
+levels warn, hold and abort of ``[gate]``.
 
 A motion-capture system that has lost a body keeps sending its *last* pose. So staleness is judged
-by content: the time since a pose last *differed* from the one before. After a jump, a body stays
-rejected: a pose must lie near the prediction from the last accepted pose and its velocity. The
-tolerance grows with the time in which *no* pose arrived, not with the time in which wrong ones
-arrived. So two bodies that the system has swapped are never accepted again by waiting: their poses
-become stale and the runner ends the throw. After a gap the tolerance may admit a swap; then the
-cable reveals it. A pose far from its prediction is rejected if it is closer to the body at the
-cable's other end, or farther from that body than the cable's length. A body that moves as predicted
-is accepted at any distance, such as a payload that has detached. Poses less frequent than ``hold``
-count as missing."""
+by content: the time since the last *accepted* pose that differed from the one before. After a jump,
+a body stays rejected: a pose must lie near the prediction from the last accepted pose and its
+velocity. The tolerance grows with the time in which *no* pose arrived, not with the time in which
+wrong ones arrived. So two bodies that the system has swapped are never accepted again by waiting:
+their poses become stale and the runner ends the throw. After a gap the tolerance may admit a swap;
+then the cable reveals it. A pose far from its prediction is rejected if it is closer to the body at
+the cable's other end, or farther from that body than the cable's length. A body that moves as
+predicted is accepted at any distance, such as a payload that has detached. Poses less frequent than
+``hold`` count as missing."""
 
 import math
 from collections import Counter

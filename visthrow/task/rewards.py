@@ -29,8 +29,9 @@ def command(p: RewardParams, action: Tensor, weights: Tensor) -> Tensor:
 
 
 def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -> Tensor:
-    """Return r_rate: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) penalises changes of the four
-    commands, shape (..., E). action, previous: shape (..., E, 5). weights: c^Delta, shape (4,).
+    """Return r_rate, which penalises changes of the four commands: -beta sum_j c^Delta_j (eta
+    |du_j| + du_j^2), shape (..., E). action, previous: shape (..., E, 5). weights: c^Delta, shape
+    (4,).
     """
     delta = action[..., :4] - previous[..., :4]
     jerk = p.l1_mix * delta.abs() + delta.square()

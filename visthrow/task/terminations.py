@@ -1,6 +1,8 @@
 """Conditions that end a throw, in training episodes and in flights on any plant.
 
-The functions take and return tensors or NumPy arrays over the batch, shape (E,) or (E, 3).
+A throw begins in ``ThrowEnv._begin`` (:mod:`visthrow.training.env.throw_env`) or in a phase of
+:mod:`visthrow.throws.flight_loop`. The functions take and return tensors or NumPy arrays over the
+batch, shape (E,) or (E, 3).
 
 Source: the paper, Section III-C."""
 

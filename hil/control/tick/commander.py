@@ -263,8 +263,8 @@ class Commander:
             backend.ask(LAND, time)
 
     def _must_level(self, estimate: Estimate) -> bool:
-        """Return whether a vehicle without poses is still tilted and must be levelled before the
-        autopilot takes it, with which it would sink.
+        """Return whether a vehicle without poses is still tilted and must be levelled first,
+        because it would sink if the autopilot took it tilted.
         """
         vehicle = self._reckoning.state
         if estimate.is_flyable or vehicle is None or self._reckoning.duration > LEVEL_TIME:
@@ -299,8 +299,8 @@ class Commander:
     def _note_hover(
         self, estimate: Estimate, command: Command | None, rates: tuple[float, ...] | None
     ) -> None:
-        """Record the command of a tick in which the vehicle hovered by the runner's commands, else
-        None, and the body rates that the autopilot reported [rad/s].
+        """Record a tick for the calibration of hover: the runner's command (None if the vehicle did
+        not hover by it), and the body rates that the autopilot reported [rad/s].
         """
         parts = self.parts
         share = None if command is None else command[0] / (parts.mass * GRAVITY)

@@ -31,8 +31,8 @@ from visthrow.common.rotations import matrix_of_quat
 from visthrow.config.bounds import Bound, Bounded
 
 STAMPS = "stamps.csv"
-"""Beside the pictures of a folder, or named as a video is with this ending: a line ``file,time_s``
-(``frame,time_s``) each.
+"""Name of the file of time stamps in a folder of pictures; for a video, the ending of its name. It
+has a line ``file,time_s`` (for a video ``frame,time_s``) for each picture.
 """
 
 DETECTORS: dict[str, type[Detector]] = {"contours": Detector, "learnt": LearntDetector}

@@ -266,8 +266,8 @@ class MotionCaptureSource(MocapSource):
 class NatNetSource(MocapSource):
     """Rigid bodies of Motive by streaming id, through the package natnet; stamps are Motive's.
 
-    The package's threads end with the first datagram that they cannot read, and take anybody's. So
-    each is looked at before them: only frames of the host's that parse get through.
+    The package's threads accept datagrams of any sender, and end at the first that they cannot
+    read. So each datagram is checked first: only parseable frames of the host reach the package.
     """
 
     def _connect(self) -> None:

@@ -6,8 +6,9 @@ A set S of candidates has the value
 
 with log Z as in :mod:`visthrow.diagnose.likelihood.evidence`. The standard deviation of random
 shares is integrated over its prior. The best-first search expands the best set that it has not yet
-expanded, and lists the neighbours: one candidate more, two more, one less, or one replaced. It ends
-when all sets near the best have been expanded. The sets near the best are the answer.
+expanded, and lists the neighbours: one candidate more, one less, or one replaced. After that, or
+after ``PATIENCE`` expansions in vain, it tries pairs of further candidates beside the best set, and
+ends if none is better. The sets near the best are the answer.
 
 Source: Madigan and Raftery 1994 (Occam's window); Raftery 1995.
 """
@@ -41,10 +42,11 @@ from visthrow.diagnose.select.candidates import (
 MOST_NEW = 2  # candidates added in one move; derivatives predict larger moves badly
 
 WINDOW = (MOST_NEW + 1) * VERY_STRONG
-"""Sets up to this many nats behind the best are kept: the penalties in a move, which adds up to
-``MOST_NEW`` candidates and may remove one. Sets up to ``STRONG`` behind count as possible.
+"""Sets up to this many nats behind the best are kept: the sum of the penalties in a move, in which
+at most ``MOST_NEW`` candidates are added and one is removed. Sets up to ``STRONG`` behind count as
+possible.
 """
-PATIENCE = 8  # expansions without a better set before the search ends
+PATIENCE = 8  # expansions without a better set before pairs are tried
 RANDOM_TRIED = 4  # most promising random shares, or pairs, that are evaluated for each set
 
 

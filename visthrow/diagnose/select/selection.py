@@ -406,8 +406,8 @@ class Selector:
         self._linear = {self.nominal: self.linear(self.nominal)}
 
     def _settle(self, point: Point, active: list[int], last: bool) -> Point:
-        """Linearise at a set and fit its sizes again, unless the last derivatives still hold or the
-        search is going on.
+        """Linearise at a set and fit its sizes again, unless the last derivatives still hold. A
+        model that is not cheap is linearised only when no other set is better (``last``).
         """
         kinds = self.problem.switches
         cheap = self.problem.model.cheap

@@ -16,7 +16,7 @@ from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.samples import Samples
 
-# smallest speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] at which channels are compared
+# smallest standard deviation at which channels are compared [m], [m/s] or [rad/s]
 MOVES = 0.05
 _FASTEST_TURN = 40.0  # rate between two samples above which an attitude jumps [rad/s]
 _AROUND_JUMP = 0.06  # time over which rates are computed [s]
@@ -28,7 +28,7 @@ _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST = 60.0  # of vehicles that throw [m/s]
 _FARTHEST = 2000.0  # likewise [m]
 _SHARES = ("motor_command", "motor_wanted", "throttle")
-# largest command with full scale 1; a controller's demand may exceed 1, a wrong unit by far more
+# largest command with full scale 1: a controller may demand more than 1, but not twice as much
 _LARGEST_SHARE = 2.0
 _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
 # correlations: of the same flight, surely of the same flight, and margin by which other axes fit
@@ -642,7 +642,8 @@ def _report_early_rates(
     relation: relations.Relation, set_points: Samples, rates: Samples, channels: str
 ) -> Row | None:
     """Report rates that precede their commands, if no delay that a controller can have fits as
-    well: the clock of the commands is late. Both fit a swing that a controller opposes.
+    well: the clock of the commands is late. A swing that a controller opposes would fit early and
+    late rates alike.
     """
     if relation.axes_delay > -DELAY_BAD or relation.axes_correlation < FIRMLY:
         return None
