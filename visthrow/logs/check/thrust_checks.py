@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from visthrow.common.errors import suggest
 from visthrow.common.rotations import rotate_back
@@ -314,6 +313,8 @@ def _curve(x: np.ndarray, varies: np.ndarray) -> tuple[np.ndarray, float] | None
     both relative to their means, and the evidence for no relation between both [nats]; None if one
     does not vary.
     """
+    from scipy.ndimage import uniform_filter1d
+
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
